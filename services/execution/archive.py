@@ -43,8 +43,8 @@ from services.identification.bridge_state import (
     against,
     usable,
 )
+from services.identification.methods import window_of
 from services.identification.outputs import FusionTask, IdentificationTask
-from services.identification.windows import window_of
 from services.recordings.mcap_ranges import ChunkIndexes, read_index
 from services.recordings.recording import is_being_written, read_info, read_messages
 from services.recordings.remote import LocalRecording, Recording, RemoteRecording, fetched

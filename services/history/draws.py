@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from services.common.errors import InputError
 from services.common.extras import check_installed
 from services.common.files import replaced_atomically
+from services.identification.methods import METHODS
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -37,7 +38,7 @@ class DrawsOfCrossing(NamedTuple):
 def check_draws(path: Path, method: str) -> None:
     """Refuse an invalid file or method before the work is done."""
     check_draws_file(path)
-    if method != "pre":
+    if not METHODS[method].has_noise_model:
         raise InputError(f"--draws: method {method} has no draws, pre has")
 
 

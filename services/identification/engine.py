@@ -20,6 +20,7 @@ from services.finding.finder import Finder, Found
 from services.identification.bridge_state import NOTHING_STORED, Fusing
 from services.identification.bridge_states import BridgeStates
 from services.identification.known import CrossingRecord
+from services.identification.methods import window_of
 from services.identification.names import Names
 from services.identification.outputs import (
     EngineOutput,
@@ -30,7 +31,6 @@ from services.identification.outputs import (
     crossing_output,
 )
 from services.identification.waiting import FromRecording, Pending, Waiting, pending_of
-from services.identification.windows import window_of
 
 _log = logging.getLogger(__name__)
 

@@ -23,18 +23,17 @@ from services.finding.crossing_data import CrossingData, Window
 from services.finding.placed import Spreads, middle_of, one_sided_channels
 from services.finding.stays import STANDING_M_PER_S, Passage
 from services.finding.streams import Samples
+from services.identification.methods import METHODS, IdentificationMethod
 from services.identification.paper_method import identify_paper
 from services.identification.pre_method import Keep as Keep
 from services.identification.pre_method import identify_pre
 from services.identification.result_parts import (
-    LONGEST_SURE_OUTAGE_S,
     CrossingTimes,
     Floats,
     longest_outage_s,
     rejected,
 )
 from services.identification.signal_checks import reasons_before_fit, unmeasured
-from services.identification.windows import window_of
 
 _log = logging.getLogger(__name__)
 Stopwatch = Callable[[], float]
@@ -60,8 +59,6 @@ _JUDGED_ASIDE_S = 1.0
 """Time in s before and behind the bridge over which signals are judged, as for thresholds."""
 _SLOW_SHARE = 0.4
 """Share of the speed on the bridge below which the road on either side is not used."""
-_LONGEST_OUTAGE_S = 8.0
-"""Longest time in s without a fix for which method `pre` finds the trajectory by the axles."""
 
 
 # A search tries values beyond the range of floats, and detects an infinite objective itself.
@@ -76,12 +73,13 @@ def identify(
 ) -> results.CrossingResult:
     """Return the result of one crossing, whatever its data; pass its draws, if any, to `keep`."""
     began = stopwatch()
-    around = window_of(settings.method)(data.stay, data.bridge, data.vehicle)
+    method = METHODS[settings.method]
+    around = method.window(data.stay, data.bridge, data.vehicle)
     trajectory = _trajectory(data, around)
     entry_s, exit_s = _entry_and_exit(data, trajectory, around)
     passing = CrossingTimes(entry_s, exit_s, _speed_m_per_s(data, entry_s, exit_s))
     reject = partial(rejected, data, settings, passing)
-    reasons = _unusable(data, settings.method, trajectory, entry_s, exit_s)
+    reasons = _unusable(data, method, trajectory, entry_s, exit_s)
     if reasons or trajectory is None or data.samples is None:
         about = {Reason.CHANNEL_MISSING: _missing(data), Reason.ROLL_NOT_SEEN: _hidden(data)}
         return reject(reasons or [Reason.FAILED], about)
@@ -102,7 +100,7 @@ def identify(
         if broken:
             return reject(broken, broken)
         cut = cut._replace(acceleration=middle_of(data.vehicle, cut.acceleration))
-        if settings.method == "pre":
+        if method.has_noise_model:
             return identify_pre(
                 data, settings, passing, *cut, report, lambda: stopwatch() - began, keep
             )
@@ -224,15 +222,15 @@ def _speed_m_per_s(data: CrossingData, entry_s: float, exit_s: float) -> float:
 
 def _unusable(
     data: CrossingData,
-    method: str,
+    method: IdentificationMethod,
     trajectory: Trajectory | None,
     entry_s: float,
     exit_s: float,
 ) -> list[Reason]:
     """Return all reasons that forbid a fit before its samples are checked."""
-    if method != "pre" and data.bridge.interior_supports_m:
+    if not method.is_general and data.bridge.interior_supports_m:
         return [Reason.CONTINUOUS_BRIDGE]
-    if method != "pre" and data.vehicle.tandem is not None:
+    if not method.is_general and data.vehicle.tandem is not None:
         return [Reason.TANDEM]
     reasons = list(data.against)
     match data.stay.passage:
@@ -249,8 +247,7 @@ def _unusable(
     if data.stay.passage is not Passage.THROUGH:
         return reasons
     outage_s = longest_outage_s(data.fixes.time_s, entry_s, exit_s)
-    longest_s = _LONGEST_OUTAGE_S if method == "pre" else LONGEST_SURE_OUTAGE_S
-    if trajectory is None or outage_s > longest_s:
+    if trajectory is None or outage_s > method.longest_outage_s:
         return [*reasons, Reason.POSITION_OUTAGE]
     times = np.linspace(entry_s, exit_s, 200)
     speed = data.stay.direction * value_at(trajectory.spline, times, 1)

@@ -17,6 +17,7 @@ from schemas.reasons import Reason, texts
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Vehicle
 from services.finding.crossing_data import CrossingData
+from services.identification.methods import LONGEST_SURE_OUTAGE_S
 
 Floats = NDArray[np.float64]
 
@@ -24,8 +25,6 @@ _ROAD_SPACING_M = 0.05
 """Spacing in m, finer than a tyre's patch of some 0.2 m."""
 _LARGEST_ACCELERATION_M_PER_S2 = 0.3
 """Acceleration above which load transfer and the height of the centre of gravity matter."""
-LONGEST_SURE_OUTAGE_S = 1.5
-"""Longest time in s between fixes of a certain trajectory without the axles' signals."""
 
 
 class CrossingTimes(NamedTuple):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from schemas.site import Receiver
 from services.common.geodesy import on_plane_m
 from services.finding.stays import STANDING_M_PER_S
-from services.identification.result_parts import LONGEST_SURE_OUTAGE_S
+from services.identification.methods import LONGEST_SURE_OUTAGE_S
 from services.inspection.finding import CheckFinding, CheckStatus, check_finding
 from services.inspection.recorded import ClockSeries, InspectedRun
 

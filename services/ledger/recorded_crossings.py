@@ -27,10 +27,10 @@ from services.finding.stays import AxleGeometry, Passage, are_one
 from services.finding.streams import Fixes, device_time_ns
 from services.finding.traffic import UnlistedVehicle
 from services.identification.known import CrossingRecord
+from services.identification.methods import window_of
 from services.identification.names import Names
 from services.identification.outputs import IdentificationTask, Output, crossing_output
 from services.identification.waiting import FromRecording, pending_of
-from services.identification.windows import window_of
 from services.recordings.recording import is_being_written, read_messages
 
 AROUND_NS: Final = 60 * NS_PER_S

@@ -34,8 +34,8 @@ from services.drives.runs import Run, run_to_messages
 from services.finding.crossing_data import CrossingData
 from services.finding.finder import crossings_in
 from services.identification.identify import Identify, identify
+from services.identification.methods import window_of
 from services.identification.pre_method import absence
-from services.identification.windows import window_of
 from services.simulation.drive import (
     LONGEST_STEP_S,
     SETTLE_S,

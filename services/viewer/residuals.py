@@ -24,6 +24,7 @@ from services.execution.blas import one_blas_thread
 from services.finding.crossing_data import CrossingData, wide_window
 from services.finding.finder import crossings_in
 from services.finding.placed import first_axle, middle_of
+from services.identification.methods import METHODS
 from services.identification.pre_method import inputs_of
 from services.identification.result_parts import nominal_parameters
 from services.viewer.crossing_view import FloatArray, ResidualCells
@@ -57,7 +58,9 @@ def residual_cells(
     identification. Of more than `most` the newest count, as each takes half a second. `progress` is
     called for each.
     """
-    fitted = [c for c in crossings if c.method == "pre" and c.parameters is not None]
+    fitted = [
+        c for c in crossings if METHODS[c.method].has_noise_model and c.parameters is not None
+    ]
     newest = sorted(fitted, key=lambda one: one.entry_time)[-most:]
     wanted = {crossing.crossing_id: crossing for crossing in newest}
     if not wanted:

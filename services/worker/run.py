@@ -31,6 +31,7 @@ from services.history.validation_files import passed_validations
 from services.identification.bridge_state import Fusing
 from services.identification.engine import Engine
 from services.identification.known import search_hash
+from services.identification.methods import METHODS
 from services.ledger.baselines import baselines_of
 from services.ledger.crossing_log import Ledger
 from services.ledger.runs import (
@@ -123,7 +124,7 @@ def _check(asked: WorkerSettings) -> None:
     except ValueError as error:
         raise InputError(str(error)) from None
     check_speaks_for(asked.tls, "worker", asked.service_id)
-    if asked.records_are_required and asked.method != "pre":
+    if asked.records_are_required and not METHODS[asked.method].has_noise_model:
         raise InputError(
             f"--method {asked.method.replace('_', '-')}: has no certificates, which realm live and "
             "--validate-first ask for; take pre, or --skip-validation"

@@ -1,0 +1,41 @@
+"""The table of identification methods: what each needs of a drive, and what it offers."""
+
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+from services.finding.crossing_data import WindowOf, close_window, wide_window
+
+_LONGEST_OUTAGE_S = 8.0
+"""Longest time in s without a fix for which method `pre` finds the trajectory by the axles."""
+LONGEST_SURE_OUTAGE_S = 1.5
+"""Longest time in s between fixes of a certain trajectory without the axles' signals."""
+
+
+class IdentificationMethod(NamedTuple):
+    """A method of identification."""
+
+    window: WindowOf
+    """Shape of the stretch of a drive that it needs."""
+    longest_outage_s: float
+    """Longest time in s without a fix on the bridge."""
+    is_general: bool
+    """Whether it knows bridges with interior supports and tandem axles."""
+    has_noise_model: bool
+    """Whether it uses the sensors' noise, and has posterior draws and site validations."""
+
+
+_PAPER: Final = IdentificationMethod(
+    close_window, LONGEST_SURE_OUTAGE_S, is_general=False, has_noise_model=False
+)
+METHODS: Final[Mapping[str, IdentificationMethod]] = {
+    "pre": IdentificationMethod(
+        wide_window, _LONGEST_OUTAGE_S, is_general=True, has_noise_model=True
+    ),
+    "least_squares": _PAPER,
+    "random_walk": _PAPER,
+}
+
+
+def window_of(method: str) -> WindowOf:
+    """Return the shape of a method's window; the paper's methods need the bridge alone."""
+    return METHODS[method].window
