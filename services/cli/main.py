@@ -18,22 +18,23 @@ from functools import partial
 from pathlib import Path
 from typing import Final, NoReturn
 
-from services.cli.alarm import add_alarm
-from services.cli.check import add_check
 from services.cli.closed_pipe import outliving_output, to_null
-from services.cli.cluster import SERVICES as CLUSTERS
-from services.cli.cluster import add_cluster
+from services.cli.commands.alarm import ALARM
 from services.cli.commands.catalog import CATALOG
 from services.cli.commands.certs import CERTS
+from services.cli.commands.check import CHECK
+from services.cli.commands.cluster import CLUSTER
 from services.cli.commands.export import EXPORT
 from services.cli.commands.fuse import FUSE
+from services.cli.commands.history import HISTORY
 from services.cli.commands.identify import IDENTIFY
 from services.cli.commands.info import INFO
 from services.cli.commands.recover import RECOVER
 from services.cli.commands.replay import REPLAY
 from services.cli.commands.survey import SURVEY
+from services.cli.commands.view import VIEW
+from services.cli.commands.watch import WATCH
 from services.cli.completion import SHELLS, completion
-from services.cli.history import add_history
 from services.cli.live import (
     SERVICES,
     add_demo,
@@ -50,8 +51,6 @@ from services.cli.parsing import Files, Handler, Parser, add_common, files_of
 from services.cli.report import add_report
 from services.cli.simulate import add_simulate
 from services.cli.validation import add_validate
-from services.cli.view import add_view
-from services.cli.watch import add_watch
 from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
 from services.common.files import check_kind, is_unicode, name_error
 from services.common.log_lines import configure_logging
@@ -62,29 +61,29 @@ _COUNTS_AT_EXIT: Final = ("_duckdb", "duckdb")
 """Modules made with nanobind, whose types are in cycles that a last collection frees."""
 _COMMANDS: Final = (
     SURVEY.add,
-    add_check,
+    CHECK.add,
     add_simulate,
     add_import,
     IDENTIFY.add,
     FUSE.add,
-    add_history,
-    add_alarm,
+    HISTORY.add,
+    ALARM.add,
     INFO.add,
     CATALOG.add,
     EXPORT.add,
     add_report,
     add_validate,
     RECOVER.add,
-    add_view,
+    VIEW.add,
     add_demo,
     add_logger,
     add_worker,
     add_truck,
     add_gateway,
     REPLAY.add,
-    add_watch,
+    WATCH.add,
     add_health,
-    add_cluster,
+    CLUSTER.add,
     CERTS.add,
 )
 """Commands in the order of `driveby --help`."""
@@ -132,7 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _print_error(str(error), EXIT_BAD_INPUT)
     is_json = options.log_format == "json"
     # The log is a service's only output.
-    verbose = options.verbose or options.handler in (*SERVICES, *CLUSTERS)
+    verbose = options.verbose or options.handler in (*SERVICES, CLUSTER.handle)
     level = logging.INFO if verbose else logging.WARNING
     configure_logging(options.log_format, level, subject_of(options))
     fail = partial(_print_error, is_json=is_json)

@@ -22,10 +22,11 @@ class Subcommand(NamedTuple, Generic[_Asked]):
 
     def add(self, commands: Any) -> None:
         """Add the command to a parser."""
-        parser = command(commands, self.name, self._handle, self.summary, self.example)
+        parser = command(commands, self.name, self.handle, self.summary, self.example)
         _add_fields(parser, self.options)
 
-    def _handle(self, given: argparse.Namespace) -> int:
+    def handle(self, given: argparse.Namespace) -> int:
+        """Run the command with what was given."""
         return self.run(_filled(self.options, given))
 
 

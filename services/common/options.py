@@ -65,22 +65,26 @@ def positional(text: str, parse: Callable[[str], Any] | None = None, **settings:
     return field(metadata={OPTION: option})
 
 
-def endpoint_option() -> Any:
+def endpoint_option(group: str = "") -> Any:
     """Return `--endpoint`: the address of the bus; None for the usual one."""
-    return opt(f"address of the logger (default: {DEFAULT_ENDPOINT})")
+    return opt(f"address of the logger (default: {DEFAULT_ENDPOINT})", group=group)
 
 
-def tls_option() -> Any:
+def realm_option(group: str = "") -> Any:
+    """Return `--realm`."""
+    return opt("realm on the bus (default: live)", default="live", group=group)
+
+
+def tls_option(group: str = "") -> Any:
     """Return `--tls`: a folder of credentials."""
-    text = (
-        f"credentials made by `driveby certs`; the default address is {DEFAULT_TLS_ENDPOINT} then"
-    )
-    return opt(text, Path, metavar="FOLDER")
+    address = f"the default address is {DEFAULT_TLS_ENDPOINT} then"
+    text = f"credentials made by `driveby certs`; {address}"
+    return opt(text, Path, group=group, metavar="FOLDER")
 
 
-def site_option(text: str, *, required: bool = False) -> Any:
+def site_option(text: str, *, group: str = "", required: bool = False) -> Any:
     """Return `--site`: a site file."""
-    return opt(text, Path, metavar="SITE.toml", required=required)
+    return opt(text, Path, group=group, metavar="SITE.toml", required=required)
 
 
 def speed_option(default: float, *, zero: str = "", group: str = "") -> Any:

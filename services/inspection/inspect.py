@@ -1,6 +1,6 @@
 """Checks before a survey: of the site file, and of a truck's recordings."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -60,7 +60,7 @@ class CheckReport(NamedTuple):
 
 
 def inspect(
-    paths: list[Path], next_file: Callable[[], Offset] = lambda: no_progress
+    paths: Sequence[Path], next_file: Callable[[], Offset] = lambda: no_progress
 ) -> Iterator[CheckReport]:
     """Check a site file and recordings; InputError for an unreadable one, or without a site.
 

@@ -83,9 +83,9 @@ class IdentifyOptions:
 
 
 def _identify(asked: IdentifyOptions) -> int:
-    from services.cli.cluster import check_scheduler, execution_of
     from services.cli.identify import identify_command
     from services.cli.identify_archive import archive_command
+    from services.cli.scheduler import check_scheduler, execution_of
 
     check_scheduler(asked)
     if asked.into is not None:

@@ -1,18 +1,27 @@
 """The command `driveby alarm`: detect, list, acknowledge and publish changes of bridges."""
 
-import argparse
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Final
 
-from services.cli.history import add_history_folder, alarm_line
-from services.cli.parsing import add_endpoint, command
+from services.cli.commands.history import alarm_line, history_option
+from services.cli.parser import Subcommand
 from services.common.endpoints import default_endpoint
 from services.common.errors import InputError
-from services.common.options import number, whole
+from services.common.options import (
+    endpoint_option,
+    flag,
+    number,
+    opt,
+    positional,
+    tls_option,
+    whole,
+)
 
 if TYPE_CHECKING:
     from services.history.alarms import AlarmCheck, AlarmSettings
+    from services.history.periods import Unit
 
 _WHAT = ("check", "list", "ack", "serve")
 _MAX_LINES = 20
@@ -23,74 +32,56 @@ _HOW = (
 )
 
 
-def add_alarm(commands: Any) -> None:
-    """Add `driveby alarm`: check, list, acknowledge, or publish on the bus."""
-    p = command(
-        commands,
-        "alarm",
-        _alarm,
-        "detect changed bridges; list, acknowledge and publish alarms",
-        "driveby alarm check --history history",
+@dataclass(frozen=True, kw_only=True)
+class AlarmOptions:
+    """What is done with alarms, and how changes are detected."""
+
+    what: str = positional("check | list | ack BRIDGE | serve", choices=_WHAT)
+    bridge: str | None = positional("bridge whose alarm is acknowledged", nargs="?")
+    history: Path = history_option()
+    realm: str | None = opt("realm of the bridge, where it is in several")
+    by: str | None = opt("with ack: name of the person who acknowledges", metavar="NAME")
+    note: str = opt("with ack: finding or action, as a note", default="", metavar="TEXT")
+    period: "Unit" = opt(
+        "period of fusion (default: week)", default="week", choices=("day", "week", "month")
     )
-    p.add_argument("what", choices=_WHAT, help="check | list | ack BRIDGE | serve")
-    p.add_argument("bridge", nargs="?", help="bridge whose alarm is acknowledged")
-    add_history_folder(p)
-    p.add_argument("--realm", help="realm of the bridge, where it is in several")
-    p.add_argument("--by", metavar="NAME", help="with ack: name of the person who acknowledges")
-    p.add_argument(
-        "--note", default="", metavar="TEXT", help="with ack: finding or action, as a note"
-    )
-    p.add_argument(
-        "--period",
-        choices=("day", "week", "month"),
-        default="week",
-        help="period of fusion (default: week)",
-    )
-    p.add_argument(
-        "--false-alarms",
-        type=number("false alarms of a bridge in a year", low=1e-6, high=10.0),
+    false_alarms: float = opt(
+        "tolerated false alarms per bridge and year (default: 0.01)",
+        number("false alarms of a bridge in a year", low=1e-6, high=10.0),
         default=0.01,
         metavar="N",
-        help="tolerated false alarms per bridge and year (default: 0.01)",
     )
-    p.add_argument(
-        "--training",
-        type=whole("a number of periods", 2, 1000),
+    training: int = opt(
+        "number of training periods before monitoring starts (default: 8)",
+        whole("a number of periods", 2, 1000),
         default=8,
         metavar="PERIODS",
-        help="number of training periods before monitoring starts (default: 8)",
     )
-    p.add_argument(
-        "--at-least",
-        type=number("a change in per cent", low=0.0, high=50.0),
+    at_least: float = opt(
+        "smallest change of EI of interest; an alarm is raised when a change is larger with "
+        "97.5 %% probability (default: 5)",
+        number("a change in per cent", low=0.0, high=50.0),
         default=5.0,
         metavar="PERCENT",
-        help="smallest change of EI of interest; an alarm is raised when a change is larger with "
-        "97.5 %% probability (default: 5)",
     )
-    p.add_argument("--all", action="store_true", help="check all bridges again")
-    p.add_argument(
-        "--processes",
-        type=whole("a number", 1, 256),
-        default=1,
-        help="number of processes (default: 1)",
-    )
-    p.add_argument(
-        "--every",
-        type=number("minutes", low=0.01, high=1e5),
+    all: bool = flag("check all bridges again")
+    processes: int = opt("number of processes (default: 1)", whole("a number", 1, 256), default=1)
+    every: float = opt(
+        "with serve: minutes between two checks (default: 60)",
+        number("minutes", low=0.01, high=1e5),
         default=60.0,
         metavar="MINUTES",
-        help="with serve: minutes between two checks (default: 60)",
     )
-    add_endpoint(p)
+    endpoint: str | None = endpoint_option()
+    tls: Path | None = tls_option()
 
 
-def _alarm(options: argparse.Namespace) -> int:
-    what: str = options.what
-    if (options.bridge is None) == (what == "ack"):
+def _alarm(options: AlarmOptions) -> int:
+    what, bridge = options.what, options.bridge
+    if (bridge is None) == (what == "ack"):
         raise InputError("alarm: ack wants the name of a bridge, and nothing else does")
-    if what == "ack":
-        return _acknowledge(options)
+    if bridge is not None:
+        return _acknowledge(options, bridge)
     if what == "list":
         return _list(options.history)
     if what == "serve":
@@ -107,7 +98,7 @@ def _alarm(options: argparse.Namespace) -> int:
     return 0
 
 
-def _settings(options: argparse.Namespace) -> "AlarmSettings":
+def _settings(options: AlarmOptions) -> "AlarmSettings":
     from services.history.alarms import AlarmSettings
 
     return AlarmSettings(
@@ -115,7 +106,7 @@ def _settings(options: argparse.Namespace) -> "AlarmSettings":
     )
 
 
-def _checked(options: argparse.Namespace) -> "AlarmCheck":
+def _checked(options: AlarmOptions) -> "AlarmCheck":
     from services.execution.blas import one_blas_thread
     from services.history.alarms import check
 
@@ -169,18 +160,18 @@ def _print_watches(folder: Path) -> None:
         print(f"and {len(others) - _MAX_LINES} more that are not watched")
 
 
-def _acknowledge(options: argparse.Namespace) -> int:
+def _acknowledge(options: AlarmOptions, bridge: str) -> int:
     from services.history.alarm_files import acknowledge, alarms_of
 
     if not options.by:
         raise InputError("alarm ack: name the person who acknowledges with --by NAME")
-    realm = _realm_of(options.history, options.bridge, options.realm)
-    alarms, problems = alarms_of(options.history, realm, options.bridge)
+    realm = _realm_of(options.history, bridge, options.realm)
+    alarms, problems = alarms_of(options.history, realm, bridge)
     for problem in problems:
         print(problem)
     standing = [alarm for alarm in alarms if alarm.acknowledged is None]
     if not standing:
-        raise InputError(f"{options.history}: no alarm of {options.bridge} stands")
+        raise InputError(f"{options.history}: no alarm of {bridge} stands")
     for alarm in standing:
         noted = acknowledge(options.history, alarm, options.by, options.note, time.time())
         print(alarm_line(noted))
@@ -196,9 +187,18 @@ def _realm_of(folder: Path, bridge: str, realm: str | None) -> str:
     return realms[0] if len(realms) == 1 else realm_of(folder, bridge, realm)
 
 
-def _serve(options: argparse.Namespace) -> int:
+def _serve(options: AlarmOptions) -> int:
     from services.cli.alarm_service import serve
 
     endpoint = options.endpoint or default_endpoint(options.tls)
     every_s = 60.0 * options.every
     return serve(options.history, lambda: _checked(options), endpoint, options.tls, every_s)
+
+
+ALARM: Final = Subcommand(
+    "alarm",
+    AlarmOptions,
+    "detect changed bridges; list, acknowledge and publish alarms",
+    "driveby alarm check --history history",
+    _alarm,
+)

@@ -1,45 +1,36 @@
 """The command `driveby check`: faults of truck, site file and recording before a survey."""
 
-import argparse
 import json
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
-from services.cli.parsing import command
-from services.common.options import OutputFile
+from services.cli.parser import Subcommand
+from services.common.options import flag, output_option, positional
 
 if TYPE_CHECKING:
     from services.inspection.inspect import CheckReport
 
 
-def add_check(commands: Any) -> None:
-    """Add `driveby check`: check a site file and recordings before a survey."""
-    p = command(
-        commands,
-        "check",
-        _check,
-        "check site file, sensors, receiver and bridge coordinates before a survey",
-        "driveby check site.toml standstill.mcap trial.mcap",
-    )
-    p.add_argument(
-        "paths",
-        type=Path,
+@dataclass(frozen=True, kw_only=True)
+class CheckOptions:
+    """What is checked before a survey."""
+
+    paths: tuple[Path, ...] = positional(
+        "a site file (default: the recordings' own), and recordings or folders of CSV "
+        "files: a minute of standstill, or any drive",
+        Path,
         nargs="*",
         metavar="SITE.toml|REC.mcap|DIR",
-        help="a site file (default: the recordings' own), and recordings or folders of CSV "
-        "files: a minute of standstill, or any drive",
     )
-    p.add_argument(
-        "--template",
-        type=OutputFile(()),
-        metavar="NEW.toml",
-        help="write a commented site file to start from, and check nothing",
+    template: Path | None = output_option(
+        "write a commented site file to start from, and check nothing", "NEW.toml"
     )
-    p.add_argument("--json", action="store_true", help="print all findings as JSON")
+    json: bool = flag("print all findings as JSON")
 
 
-def _check(options: argparse.Namespace) -> int:
+def _check(options: CheckOptions) -> int:
     from services.common.errors import InputError
     from services.common.files import check_writable, write_atomically
     from services.common.progress import reading_bar
@@ -142,3 +133,12 @@ def as_json(report: "CheckReport") -> dict[str, Any]:
             for finding in report.findings
         ],
     }
+
+
+CHECK: Final = Subcommand(
+    "check",
+    CheckOptions,
+    "check site file, sensors, receiver and bridge coordinates before a survey",
+    "driveby check site.toml standstill.mcap trial.mcap",
+    _check,
+)

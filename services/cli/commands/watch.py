@@ -1,15 +1,17 @@
 """The command `driveby watch`: a realm as a page on a terminal, elsewhere line by line."""
 
-import argparse
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
-from services.cli.parsing import a_console, add_endpoint, add_realm, command
+from services.cli.parser import Subcommand
+from services.cli.parsing import a_console
 from services.common.endpoints import default_endpoint
+from services.common.options import endpoint_option, realm_option, tls_option
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -22,29 +24,16 @@ _HINT_AFTER_S: Final = 2.0
 """Silence in s after which a hint names other realms."""
 
 
-def add_watch(commands: Any) -> None:
-    """Add `driveby watch`: show trucks, crossings and results live."""
-    p = command(
-        commands,
-        "watch",
-        _watch,
-        "show trucks, crossings and results in the terminal as they arrive",
-        "driveby watch --realm sim-demo",
-    )
-    add_endpoint(p)
-    add_realm(p)
+@dataclass(frozen=True, kw_only=True)
+class WatchOptions:
+    """A realm to show."""
+
+    endpoint: str | None = endpoint_option()
+    tls: Path | None = tls_option()
+    realm: str = realm_option()
 
 
-def _watch(options: argparse.Namespace) -> int:
-    return watch_command(
-        endpoint=options.endpoint or default_endpoint(options.tls),
-        realm=options.realm,
-        tls=options.tls,
-        console=a_console(),
-    )
-
-
-def watch_command(*, endpoint: str, realm: str, tls: Path | None, console: "Console") -> int:
+def _watch(asked: WatchOptions) -> int:
     """Show a realm until a signal arrives; return 0. Wait for the router without limit.
 
     InputError: a bad realm, endpoint or credentials.
@@ -52,9 +41,10 @@ def watch_command(*, endpoint: str, realm: str, tls: Path | None, console: "Cons
     from services.bus.playback import leave_at_once, stopped_by_signals
     from services.bus.realm_listener import open_listener
 
+    endpoint, console = asked.endpoint or default_endpoint(asked.tls), a_console()
     with (
         stopped_by_signals(leave_at_once) as stop,
-        open_listener(endpoint, tls, realm, stop.is_set) as heard,
+        open_listener(endpoint, asked.tls, asked.realm, stop.is_set) as heard,
     ):
         if heard is None:
             return 0
@@ -122,3 +112,12 @@ def _print_lines(
             hinted = hint
             print_line(hint or None)
         stop.wait(_PERIOD_S)
+
+
+WATCH: Final = Subcommand(
+    "watch",
+    WatchOptions,
+    "show trucks, crossings and results in the terminal as they arrive",
+    "driveby watch --realm sim-demo",
+    _watch,
+)

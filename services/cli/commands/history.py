@@ -1,96 +1,77 @@
 """The command `driveby history`: results over years, and one bridge over time."""
 
-import argparse
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
-from services.cli.parsing import (
-    EXIT_SOMETHING_LOST,
-    a_console,
-    add_file,
-    add_output_file,
-    add_output_folder,
-    command,
-)
+from services.cli.parser import Subcommand
+from services.cli.parsing import EXIT_SOMETHING_LOST, a_console
 from services.common.errors import InputError, one_line
 from services.common.kinds import HISTORY_CSV, HISTORY_JSON, RERUN
+from services.common.options import (
+    file_option,
+    flag,
+    opt,
+    output_folder_option,
+    output_option,
+    positional,
+)
 
 if TYPE_CHECKING:
     from schemas.alarms import Alarm
     from schemas.results import Results
     from services.history.bridge_history import BridgeHistory, HistoryEntry
-    from services.history.periods import FusedPeriod
+    from services.history.periods import FusedPeriod, Unit
 
-HISTORY = Path("history")
+HISTORY_FOLDER: Final = Path("history")
 _ADD = "add"
 
 
-def add_history(commands: Any) -> None:
-    """Add `driveby history`: add results, or show a bridge over time."""
-    p = command(
-        commands,
-        "history",
-        _history,
-        "store results over years and show EI of each element over time",
-        "driveby history add drive.json --history history && "
-        "driveby history bridge-1 --history history",
-    )
-    p.add_argument(
-        "words",
+def history_option() -> Any:
+    """Return `--history`: the folder of a history."""
+    text = "folder of the history (default: history)"
+    return opt(text, Path, default=HISTORY_FOLDER, metavar="DIR")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HistoryOptions:
+    """Results to add, or a bridge to show."""
+
+    words: tuple[str, ...] = positional(
+        "a bridge to show, or add and results to add: files, or folders of identify --into; "
+        "nothing: all bridges in a table",
         nargs="*",
         metavar="BRIDGE | add RESULTS …",
-        help="a bridge to show, or add and results to add: files, or folders of identify --into; "
-        "nothing: all bridges in a table",
     )
-    add_history_folder(p)
-    p.add_argument(
-        "--realm", help="realm of the bridge, where it is in several (default: the only one)"
+    history: Path = history_option()
+    realm: str | None = opt("realm of the bridge, where it is in several (default: the only one)")
+    period: "Unit" = opt(
+        "period of fusion (default: month)", default="month", choices=("day", "week", "month")
     )
-    p.add_argument(
-        "--period",
-        choices=("day", "week", "month"),
-        default="month",
-        help="period of fusion (default: month)",
+    temperature: Path | None = file_option(
+        "with add: CSV file of temperatures (time_s,temperature_deg_c[,bridge])", "T.csv"
     )
-    add_file(
-        p,
-        "--temperature",
-        "T.csv",
-        "with add: CSV file of temperatures (time_s,temperature_deg_c[,bridge])",
+    defer_fusion: bool = flag("with add: postpone fusion until the bridge is first shown")
+    csv: Path | None = output_option(
+        "CSV file with a row for each period and element", "OUT.csv", HISTORY_CSV
     )
-    p.add_argument(
-        "--defer-fusion",
-        action="store_true",
-        help="with add: postpone fusion until the bridge is first shown",
+    json: Path | None = output_option("JSON file of periods and alarms", "OUT.json", HISTORY_JSON)
+    figures: Path | None = output_folder_option(
+        "folder for figures of the bridge over time, as PNG and SVG"
     )
-    text = "CSV file with a row for each period and element"
-    add_output_file(p, "--csv", "OUT.csv", text, HISTORY_CSV)
-    add_output_file(p, "--json", "OUT.json", "JSON file of periods and alarms", HISTORY_JSON)
-    add_output_folder(p, "--figures", "folder for figures of the bridge over time, as PNG and SVG")
-    add_output_file(p, "--rrd", "OUT.rrd", "Rerun file of EI over time", RERUN)
-    p.add_argument("--view", action="store_true", help="open EI over time in the Rerun viewer")
-    p.add_argument("--web", action="store_true", help="open it in the browser")
-    p.add_argument("--sql", metavar="SELECT …", help="query of the table crossings (DuckDB)")
+    rrd: Path | None = output_option("Rerun file of EI over time", "OUT.rrd", RERUN)
+    view: bool = flag("open EI over time in the Rerun viewer")
+    web: bool = flag("open it in the browser")
+    sql: str | None = opt("query of the table crossings (DuckDB)", metavar="SELECT …")
 
 
-def add_history_folder(p: argparse.ArgumentParser) -> None:
-    """Add `--history`: the folder of a history."""
-    p.add_argument(
-        "--history",
-        type=Path,
-        default=HISTORY,
-        metavar="DIR",
-        help="folder of the history (default: history)",
-    )
-
-
-def _history(options: argparse.Namespace) -> int:
-    words: list[str] = options.words
-    if words[:1] == [_ADD] and len(words) > 1:
+def _history(options: HistoryOptions) -> int:
+    words = options.words
+    if words[:1] == (_ADD,) and len(words) > 1:
         return _add(options, [Path(word) for word in words[1:]])
     if options.temperature is not None:
         raise InputError("--temperature: is for driveby history add RESULTS")
@@ -99,7 +80,7 @@ def _history(options: argparse.Namespace) -> int:
     return _show(options, words[0]) if words else _table(options)
 
 
-def _add(options: argparse.Namespace, paths: list[Path]) -> int:
+def _add(options: HistoryOptions, paths: list[Path]) -> int:
     problems: list[str] = []
     # All of them are checked before any is written.
     sources = [(path, _results_of(path, problems.append)) for path in paths]
@@ -132,7 +113,7 @@ def _results_of(path: Path, problem: Callable[[str], object]) -> "Iterable[Resul
 
 
 def _add_one(
-    options: argparse.Namespace, path: Path, some: "Iterable[Results]", driven: "set[HistoryEntry]"
+    options: HistoryOptions, path: Path, some: "Iterable[Results]", driven: "set[HistoryEntry]"
 ) -> str:
     """Add a file or a folder, record the positions of its crossings, and return a summary."""
     from services.history.bridge_history import HistoryEntry
@@ -156,7 +137,7 @@ def _add_one(
     return f"{path}: {new} crossings{of} added{before}{beside}"
 
 
-def _table(options: argparse.Namespace) -> int:
+def _table(options: HistoryOptions) -> int:
     from services.history.sql import overview, query
 
     answer = (
@@ -172,7 +153,7 @@ def _table(options: argparse.Namespace) -> int:
     return 0
 
 
-def _show(options: argparse.Namespace, bridge: str) -> int:
+def _show(options: HistoryOptions, bridge: str) -> int:
     from services.common.files import check_writable, write_atomically
     from services.execution.blas import one_blas_thread
     from services.history.bridge_history import bridge_history
@@ -181,7 +162,7 @@ def _show(options: argparse.Namespace, bridge: str) -> int:
     for path in (options.csv, options.json, options.rrd):
         if path is not None:
             check_writable(path)
-    folder: Path = options.history
+    folder = options.history
     realm = realm_of(folder, bridge, options.realm)
     console = a_console()
     with console.status("fusing crossings"), one_blas_thread():
@@ -204,7 +185,7 @@ def _show(options: argparse.Namespace, bridge: str) -> int:
     return 0
 
 
-def _drawn(options: argparse.Namespace, past: "BridgeHistory") -> Iterator[Path]:
+def _drawn(options: HistoryOptions, past: "BridgeHistory") -> Iterator[Path]:
     """Draw the requested pictures."""
     if options.figures is not None:
         from services.common.files import make_folder
@@ -318,3 +299,13 @@ def _json(past: "BridgeHistory") -> str:
 
 def _day(time_s: float) -> str:
     return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"
+
+
+HISTORY: Final = Subcommand(
+    "history",
+    HistoryOptions,
+    "store results over years and show EI of each element over time",
+    "driveby history add drive.json --history history && "
+    "driveby history bridge-1 --history history",
+    _history,
+)

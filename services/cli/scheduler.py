@@ -1,0 +1,89 @@
+"""The option `--scheduler`: where crossings are identified."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from services.cli.commands.identify import IdentifyOptions
+from services.cli.parsing import option_of
+from services.common.errors import InputError
+
+if TYPE_CHECKING:
+    from services.execution.dispatch import CrossingExecutor
+    from services.execution.scheduler import Credentials
+
+_PROCESSES: Final = "processes"
+MAX_PROCESSES: Final = 256
+
+
+def check_scheduler(options: IdentifyOptions) -> None:
+    """Raise InputError for an invalid `--scheduler`, before anything is started."""
+    said: str | None = options.scheduler
+    is_cluster = said is not None and said.partition(":")[0] != _PROCESSES
+    for name in ("tls", "batch", "reconnect_timeout"):
+        if getattr(options, name) is not None and not is_cluster:
+            raise InputError(
+                f"{option_of(name)}: belongs to a cluster, --scheduler tcp://… or tls://…"
+            )
+    if said is not None and not is_cluster:
+        _number(said)
+    if is_cluster:
+        from services.execution.scheduler import check_address
+
+        check_address(str(said), _credentials(options))
+
+
+@contextmanager
+def execution_of(options: IdentifyOptions) -> "Iterator[CrossingExecutor | None]":
+    """Run the executor of `--scheduler`, started at entry; None without the option."""
+    said: str | None = options.scheduler
+    if said is None:
+        yield None
+    elif said.partition(":")[0] == _PROCESSES:
+        from services.execution.processes import ProcessExecutor
+
+        with ProcessExecutor(_number(said)) as processes:
+            yield processes
+    else:
+        from services.execution.cluster import BATCH, PATIENCE_S, DaskExecutor
+
+        with DaskExecutor(
+            said,
+            credentials=_credentials(options),
+            batch=options.batch or BATCH,
+            patience_s=options.reconnect_timeout or PATIENCE_S,
+        ) as cluster:
+            yield cluster
+
+
+def _credentials(options: IdentifyOptions) -> "Credentials | None":
+    return None if options.tls is None else credentials_of(options.tls, "client")
+
+
+def credentials_of(folder: Path, role: str) -> "Credentials":
+    """Return the files of a folder of credentials; InputError for those of another role."""
+    from services.bus.credentials import AUTHORITY, CERTIFICATE, KEY, check_speaks_for
+    from services.execution.scheduler import Credentials
+
+    check_speaks_for(folder, role)
+    return Credentials(folder / AUTHORITY, folder / CERTIFICATE, folder / KEY)
+
+
+def _number(said: str) -> int:
+    _, _, text = said.partition(":")
+    if said == _PROCESSES:
+        return cores()
+    try:
+        number = int(text)
+    except ValueError:
+        number = 0
+    if not 1 <= number <= MAX_PROCESSES:
+        raise InputError(f"--scheduler: is {said!r}, the number must be from 1 to {MAX_PROCESSES}")
+    return number
+
+
+def cores() -> int:
+    """Return the number of processors, up to the limit."""
+    return min(os.cpu_count() or 1, MAX_PROCESSES)
