@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 from schemas.events import Event, EventKind
 from schemas.messages import check_stamp
-from schemas.signals import NS_PER_S, Identity, Stamp
-from schemas.topics import Key, Message, Topic, is_from_recording, topic
+from schemas.signals import Identity
+from schemas.topics import Key, Message, Topic, topic
 from services.bus.subscription import RawSample, SeenSequences
 from services.common.intervals import Intervals
-from services.logger.clocks import TruckClock, clock_step_ns
+from services.logger.clock_watch import ClockWatch
 from services.logger.known_streams import StreamCache, StreamRecord
 
 GAP_PATIENCE_S = 5.0
@@ -67,11 +67,7 @@ class Intake:
     """Stream, boot, first and last of messages that will never be written; the caller empties it.
     """
     _streams: StreamCache = field(init=False)
-    _clocks: dict[tuple[str, str], TruckClock] = field(default_factory=dict)
-    _clock_stream: dict[tuple[str, str], tuple[str, int]] = field(default_factory=dict)
-    _own_clock_ns: int | None = None
-    _lag_ns: int = 0
-    _due: list[tuple[Key, Event]] = field(default_factory=list)
+    _clocks: ClockWatch = field(default_factory=ClockWatch)
     _refused: dict[str, Refusals] = field(default_factory=dict)
     _refused_reported_s: dict[str, float] = field(default_factory=dict)
     _late: Counter[tuple[Key, int]] = field(default_factory=Counter)
@@ -116,7 +112,7 @@ class Intake:
             return None
         self.counts["accepted"] += 1
         if not received.recovered:
-            self._watch_clock(where, identity, stamp, now_ns)
+            self._clocks.note(where, identity, stamp, now_ns)
         return Message(where, received.payload, *identity, stamp.wall_time_ns, now_ns)
 
     def adopt(self, where: Key, boot_id: int, first: int, last: int, now_ns: int) -> bool:
@@ -156,8 +152,7 @@ class Intake:
 
         `now_s` is a monotonic clock. When `closing`, current gaps are reported at once.
         """
-        events = self._own_clock(now_ns, now_s) + self._due
-        self._due = []
+        events = self._clocks.steps(self.realm or "live", now_ns, now_s)
         events += self._refusals(now_ns, now_s, closing=closing)
         for (where, boot_id), number in self._late.items():
             text = "came late and stand later in the file"
@@ -172,39 +167,23 @@ class Intake:
         self._lost.clear()
         patience_s = 0.0 if closing else GAP_PATIENCE_S
         events += self._gaps(now_ns, now_s, patience_s)
-        events += self._drifts(now_ns, now_s)
+        events += self._clocks.drifts(now_ns, now_s)
         return events
 
     def lag_s(self) -> float:
-        """Return the longest delay of live messages since the last call.
-
-        It includes the clocks' difference and the length of a batch, whose time is that of its
-        start.
-        """
-        lag_ns, self._lag_ns = self._lag_ns, 0
-        return lag_ns * 1e-9
+        """Return the longest delay of live messages since the last call."""
+        return self._clocks.lag_s()
 
     def clock_figures(self) -> dict[str, float]:
         """Return each truck's lag behind the logger's clock, and its drift, by name."""
-        figures = {}
-        for (_, vehicle), clock in self._clocks.items():
-            drift = clock.drift()
-            if drift is not None:
-                figures[f"clock_offset_s/{vehicle}"] = drift.offset_s
-                if drift.drift_ppm is not None:
-                    figures[f"clock_drift_ppm/{vehicle}"] = drift.drift_ppm
-        return figures
+        return self._clocks.figures()
 
     def _forget(self, where: Key, boot_id: int) -> None:
         name = (where, boot_id)
         for memory in (self.seen.streams, self._holes, self._reported):
             memory.pop(name, None)
         self.forgotten.append(name)
-        truck = (where.realm, where.identifier)
-        clock = self._clocks.get(truck)
-        is_its = self._clock_stream.get(truck, ("", 0))[0] == where.stream
-        if clock is not None and clock.boot_id == boot_id and is_its:
-            del self._clocks[truck], self._clock_stream[truck]
+        self._clocks.forget(where, boot_id)
 
     def _is_new(self, where: Key, identity: Identity, stream: StreamRecord, payload: bytes) -> bool:
         name = (where, identity.boot_id)
@@ -285,62 +264,6 @@ class Intake:
                         _event(where, boot_id, EventKind.GAP, now_ns, "missing", number, first)
                     )
         self.counts["missing"] = missing
-        return events
-
-    def _watch_clock(self, where: Key, identity: Identity, stamp: Stamp, now_ns: int) -> None:
-        """Compare a live message's times with earlier ones, and with its arrival."""
-        if stamp.device_time_ns is None or is_from_recording(where.realm):
-            return
-        truck = (where.realm, where.identifier)
-        stream, highest = self._clock_stream.get(truck, (where.stream, -1))
-        if stream != where.stream and where.stream != "accel":
-            return  # one stream is enough; accelerations are the most frequent
-        clock = self._clocks.get(truck)
-        if clock is None or stream != where.stream or identity.boot_id > clock.boot_id:
-            clock = self._clocks[truck] = TruckClock(identity.boot_id)
-            highest = -1
-        if identity.boot_id < clock.boot_id or identity.sequence <= highest:
-            return
-        self._clock_stream[truck] = (where.stream, identity.sequence)
-        step_ns = clock.wall_against_device(stamp.wall_time_ns, stamp.device_time_ns)
-        if step_ns:
-            text = f"the truck's wall clock jumped by {step_ns * 1e-9:+.3f} s"
-            event = Event(
-                EventKind.CLOCK_STEP,
-                now_ns,
-                text,
-                vehicle=where.identifier,
-                stream=where.stream,
-                boot_id=identity.boot_id,
-                first_sequence=identity.sequence,
-            )
-            self._due.append((where, event))
-        clock.arrived(stamp.wall_time_ns, now_ns)
-        self._lag_ns = max(self._lag_ns, now_ns - stamp.wall_time_ns)
-
-    def _own_clock(self, now_ns: int, now_s: float) -> list[tuple[Key, Event]]:
-        offset_ns = now_ns - round(now_s * NS_PER_S)
-        step_ns = clock_step_ns(self._own_clock_ns, offset_ns)
-        self._own_clock_ns = offset_ns
-        if not step_ns:
-            return []
-        for clock in self._clocks.values():
-            clock.forget()
-        text = f"the logger's wall clock jumped by {step_ns * 1e-9:+.3f} s"
-        where = Key(self.realm or "live", "vehicle", "", "")
-        return [(where, Event(EventKind.CLOCK_STEP, now_ns, text))]
-
-    def _drifts(self, now_ns: int, now_s: float) -> list[tuple[Key, Event]]:
-        events = []
-        for (realm, vehicle), clock in self._clocks.items():
-            drift = clock.due(now_s)
-            if drift is not None:
-                ppm = "" if drift.drift_ppm is None else f", {drift.drift_ppm:+.1f} ppm"
-                text = f"the truck's clock is {drift.offset_s:.3f} s behind the logger's{ppm}"
-                event = Event(
-                    EventKind.CLOCK_DRIFT, now_ns, text, vehicle=vehicle, boot_id=clock.boot_id
-                )
-                events.append((Key(realm, "vehicle", vehicle, ""), event))
         return events
 
 

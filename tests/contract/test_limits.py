@@ -38,7 +38,6 @@ LONG_MODULES = {
 
 LONG_CLASSES = {
     "services.execution.cluster:DaskExecutor": 273,
-    "services.logger.intake:Intake": 293,
     "services.logger.writer:FileWriter": 395,
     "services.truck.spool:Spool": 260,
     "services.viewer.live_view:LiveView": 315,
