@@ -23,7 +23,7 @@ from services.viewer.rerun_parts import (
     log_line,
     rgb,
 )
-from services.viewer.rerun_places import BridgeOnMap, bridges_of_site
+from services.viewer.rerun_places import M_PER_DEGREE, BridgeOnMap, bridges_of_site
 from services.viewer.strip import STRIP_HEIGHT, STRIP_WIDTH
 
 PERIOD_S: Final = 0.02
@@ -33,6 +33,8 @@ ROADS_MIDDLE: Final = STRIP_HEIGHT + 330.0
 ROADS_REACH: Final = 120.0
 _QUALITY: Final = 95
 _MAX_ALARMS: Final = 1000
+_NEAR_M: Final = 2_000.0
+"""Distance in m up to which a truck is on a bridge's plan."""
 NO_RESULT: Final = "No result yet. Results appear seconds after a truck leaves the bridge."
 
 
@@ -52,6 +54,15 @@ def of_site(site: Site | None) -> dict[str, SiteBridge]:
         bridge.id: SiteBridge(on_map, bridge, bridge_frame(bridge))
         for bridge, on_map in zip(site.bridges, bridges_of_site(site), strict=True)
     }
+
+
+def bridges_near(names: Iterable[str], starts: FloatArray, places: FloatArray) -> list[str]:
+    """Return the bridges, at `starts` (n, 2), near the last of the positions (m, 2)."""
+    if not starts.size:
+        return []
+    north, east = ((starts - places[-1]) * M_PER_DEGREE).T
+    apart_m = np.hypot(north, east * np.cos(np.radians(places[-1, 0])))
+    return [name for name, is_near in zip(names, apart_m < _NEAR_M, strict=True) if is_near]
 
 
 class TimestampedStream:

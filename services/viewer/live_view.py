@@ -7,10 +7,8 @@ viewers can drop all old ones.
 
 from __future__ import annotations
 
-import math
 import time
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -27,7 +25,6 @@ from services.bus.realm_listener import BusMessage
 from services.common.geodesy import to_chainage
 from services.identification.comparison import compare, estimate_of_state, sentences
 from services.viewer.crossing_view import (
-    VERDICT_COLOURS,
     CrossingView,
     ElementGeometry,
     FloatArray,
@@ -37,8 +34,9 @@ from services.viewer.crossing_view import (
     view_of_crossing,
 )
 from services.viewer.layout import is_doubtful
+from services.viewer.live_clock import SampleClock
+from services.viewer.live_lanes import CrossingLanes
 from services.viewer.live_layout import (
-    lane_entity,
     live_blueprint,
     result_root,
     trend_root,
@@ -46,8 +44,8 @@ from services.viewer.live_layout import (
 from services.viewer.live_parts import (
     TimestampedStream,
     bridge_text,
+    bridges_near,
     clock_text,
-    extremes,
     log_roads,
     log_trend,
     log_trend_style,
@@ -55,18 +53,15 @@ from services.viewer.live_parts import (
     of_site,
     result_text,
 )
+from services.viewer.live_trucks import LiveTruck
 from services.viewer.rerun_crossing import log_rigidity
-from services.viewer.rerun_file import acceleration_series
 from services.viewer.rerun_parts import (
-    MUTED,
     channel_colour,
     columns_of,
     log_line,
-    rgb,
     send_scalars,
 )
 from services.viewer.rerun_places import (
-    M_PER_DEGREE,
     BridgeOnMap,
     log_bridge,
     log_marker,
@@ -80,54 +75,18 @@ MAX_TRUCKS: Final = 6
 """Maximum number of trucks with accelerations; of others only the position is drawn."""
 MAX_BRIDGES: Final = 8
 """Maximum number of bridges with a tab: those that were approached or crossed first."""
-_TRACK_FIXES: Final = 300
-"""Number of fixes, one per second, of a truck's track on the map."""
-_NEAR_M: Final = 2_000.0
-"""Distance in m up to which a truck is on a bridge's plan."""
-_SOON_NS: Final = 120_000_000_000
-"""Delay in ns after the exit beyond which a result is dated at the exit."""
-_TICKS_S: Final = 20.0
-"""Time in s for which the view's clock continues after the last message.
-
-A state that has just started is visible by it. Then the clock stops, and the window of
-accelerations still holds the last ones.
-"""
 _PLACES_EVERY_S: Final = 1.0
 """Interval in s at which a truck is moved on the map and the plans.
 
 Each move takes a kilobyte per view, at a server that keeps the history for later viewers.
 """
-_GAP_NS: Final = 200_000_000
-"""Gap in ns at which a line of accelerations is broken."""
-_LANE_STEP_NS: Final = 1_000_000
-"""Smallest time in ns between two states of a crossing, so that the first one is visible."""
 
-LANE_STATES: Final = {
-    "on the bridge": "#0072B2",
-    "complete": "#56B4E9",
-    "waits for validation": "#CC79A7",
-    "identifying": "#999999",
-    **VERDICT_COLOURS,
-}
 _STATES: Final = {
     pb.DETECTED: "on the bridge",
     pb.COMPLETE: "complete",
     pb.WAITING_NOT_VALIDATED: "waits for validation",
     pb.IDENTIFYING: "identifying",
 }
-
-
-class _Truck:
-    """Data of a truck that are not drawn yet, and the state of its picture."""
-
-    def __init__(self) -> None:
-        self.batches: list[AccelBatch] = []
-        self.fixes: list[GnssFix] = []
-        self.track: deque[tuple[float, float]] = deque(maxlen=_TRACK_FIXES)
-        self.channels: set[str] = set()
-        self.drawn_to_ns = 0
-        self.placed_s = -math.inf
-        self.track_ns = 0
 
 
 class LiveView:
@@ -143,7 +102,7 @@ class LiveView:
         self._clock = clock
         recording.set_log_time_enabled(False)
         recording.set_log_tick_enabled(False)
-        self._trucks: dict[str, _Truck] = {}
+        self._trucks: dict[str, LiveTruck] = {}
         self._site = of_site(site)
         self._starts = np.array([one.on_map.start for one in self._site.values()]).reshape(-1, 2)
         self._elements_of_results: dict[str, ElementGeometry] = {}
@@ -158,11 +117,8 @@ class LiveView:
         self._alarms: dict[str, Alarm] = {}
         """Alarms that stand."""
         self._trends: set[str] = set()
-        self._lanes: dict[tuple[str, str], int] = {}
-        """Time up to which crossings are drawn, by bridge and truck."""
-        self._latest_ns = 0
-        self._latest_s = self._received_s = clock()
-        """Times of the newest sample and of the last message."""
+        self._lanes = CrossingLanes(recording)
+        self._time = SampleClock(clock)
         self._layout_is_old = True
 
     @property
@@ -173,7 +129,7 @@ class LiveView:
     def ingest(self, message: BusMessage) -> None:
         """Add a message; skip an undecodable one, which the logger counts."""
         key, _, payload = message
-        self._received_s = self._clock()
+        self._time.receive()
         try:
             match (key.owner, key.stream):
                 case ("vehicle", "accel"):
@@ -194,9 +150,10 @@ class LiveView:
     def flush(self) -> None:
         """Draw the new data of trucks; call it a few times a second."""
         for name, truck in self._trucks.items():
-            self._draw_accelerations(name, truck)
+            truck.draw_accelerations(self._recording, name)
             self._draw_position(name, truck)
-        self._tick()
+        if self._time.is_running:
+            TimestampedStream(self._recording, self._time.now_ns()).log("now", rr.Scalars(0.0))
         if self._layout_is_old and not self.is_empty:
             self._layout_is_old = False
             shown = {name: truck.channels for name, truck in self._trucks.items() if truck.channels}
@@ -206,7 +163,7 @@ class LiveView:
 
     def _add_batch(self, vehicle: str, batch: AccelBatch) -> None:
         truck = self._truck(vehicle)
-        self._note_time(batch.wall_time_ns)
+        self._time.note(batch.wall_time_ns)
         plotted = sum(bool(one.channels) for one in self._trucks.values())
         if not truck.channels and plotted >= MAX_TRUCKS:
             return
@@ -219,7 +176,7 @@ class LiveView:
 
     def _add_fix(self, vehicle: str, fix: GnssFix) -> None:
         truck = self._truck(vehicle)
-        self._note_time(fix.wall_time_ns)
+        self._time.note(fix.wall_time_ns)
         truck.fixes.append(fix)
 
     def _add_state(self, crossing: pb.Crossing) -> None:
@@ -230,12 +187,14 @@ class LiveView:
         moment_ns = crossing.entry_time_ns if state == "on the bridge" else crossing.time_ns
         if state in ("identifying", "waits for validation"):
             moment_ns = self._moment_ns(crossing.vehicle, crossing.exit_time_ns)
-        self._draw_lane(crossing.bridge, crossing.vehicle, state, moment_ns)
+        if crossing.bridge in self._bridges:
+            self._lanes.draw(crossing.bridge, crossing.vehicle, state, moment_ns)
 
     def _add_result(self, crossing: CrossingResult) -> None:
         moment_ns = self._moment_ns(crossing.vehicle, round(crossing.exit_time * 1e9))
         self._add_bridge(crossing.bridge)
-        self._draw_lane(crossing.bridge, crossing.vehicle, crossing.verdict, moment_ns)
+        if crossing.bridge in self._bridges:
+            self._lanes.draw(crossing.bridge, crossing.vehicle, crossing.verdict, moment_ns)
         elements = self._elements(crossing)
         drawn_s, _ = self._drawn.get(crossing.bridge, (0.0, ""))
         if crossing.entry_time < drawn_s or crossing.bridge not in self._bridges:
@@ -271,7 +230,7 @@ class LiveView:
         used = len(state.crossings_used)
         wording = state.finding or " ".join(sentences(compared))
         self._findings[bridge] = f"**All {used}:** {wording}" if used > 1 else ""
-        moment_ns = max(time_ns, self._lanes_end_ns(bridge))
+        moment_ns = max(time_ns, self._lanes.end_ns(bridge))
         self._draw_text(bridge, moment_ns)
         if found is not None:
             is_doubtful = state.verdict not in (None, "good")
@@ -281,34 +240,10 @@ class LiveView:
         """Add an alarm. It stands for months: a truck gives a bridge a tab, an alarm does not."""
         note_alarm(self._alarms, alarm)
         if alarm.bridge in self._bridges:
-            now_ns = self._now_ns() if self._latest_ns else 0
-            self._draw_text(alarm.bridge, max(now_ns, self._lanes_end_ns(alarm.bridge)))
+            now_ns = self._time.now_ns() if self._time.latest_ns else 0
+            self._draw_text(alarm.bridge, max(now_ns, self._lanes.end_ns(alarm.bridge)))
 
-    def _tick(self) -> None:
-        if self._latest_ns and self._clock() - self._received_s < _TICKS_S:
-            TimestampedStream(self._recording, self._now_ns()).log("now", rr.Scalars(0.0))
-
-    def _now_ns(self) -> int:
-        """Return the present time on the clock of the samples."""
-        return self._latest_ns + round(1e9 * (self._clock() - self._latest_s))
-
-    def _draw_accelerations(self, vehicle: str, truck: _Truck) -> None:
-        if not truck.batches:
-            return
-        batches = sorted(truck.batches, key=lambda one: one.wall_time_ns)
-        truck.batches = []
-        for channel, (time_ns, samples) in acceleration_series(batches).items():
-            times, values = extremes(time_ns, samples, batches[0].channels[channel].rate_hz)
-            if truck.drawn_to_ns and times[0] - truck.drawn_to_ns > _GAP_NS:
-                times = np.insert(times, 0, truck.drawn_to_ns + _GAP_NS // 2)
-                values = np.insert(values, 0, np.nan)
-            entity = f"vehicle/{vehicle}/acceleration/{channel}"
-            send_scalars(self._recording, entity, values, time_ns=times)
-        last = batches[-1]
-        longest_s = max(one.samples.size / one.rate_hz for one in last.channels.values())
-        truck.drawn_to_ns = last.wall_time_ns + round(1e9 * longest_s)
-
-    def _draw_position(self, vehicle: str, truck: _Truck) -> None:
+    def _draw_position(self, vehicle: str, truck: LiveTruck) -> None:
         now_s = self._clock()
         if not truck.fixes or now_s - truck.placed_s < _PLACES_EVERY_S:
             return
@@ -321,41 +256,13 @@ class LiveView:
         self._recording.send_columns(f"map/position/{vehicle}", columns_of(time_ns, None), columns)
         speeds = np.array([fix.speed_m_per_s for fix in fixes])
         send_scalars(self._recording, f"vehicle/{vehicle}/speed", speeds, time_ns=time_ns)
-        self._draw_track(vehicle, truck, fixes)
-        for bridge in self._near(places):
+        truck.draw_track(self._recording, vehicle, fixes)
+        for bridge in bridges_near(self._site, self._starts, places):
             self._add_bridge(bridge)
             if bridge in self._bridges:
                 along, left = to_chainage(self._site[bridge].frame, *places.T)
                 entity = f"{plan_root(bridge)}/truck/{vehicle}"
                 send_places(self._recording, entity, np.column_stack((along, -left)), time_ns)
-
-    def _draw_track(self, vehicle: str, truck: _Truck, fixes: Sequence[GnssFix]) -> None:
-        """Draw the track, one fix per second."""
-        for fix in fixes:
-            if fix.wall_time_ns - truck.track_ns < 1_000_000_000:
-                continue
-            truck.track_ns = fix.wall_time_ns
-            truck.track.append((fix.latitude_deg, fix.longitude_deg))
-        if len(truck.track) > 1:
-            style = {"radii": rr.Radius.ui_points(1.0), "colors": [rgb(MUTED)]}
-            line = rr.GeoLineStrings(lat_lon=[np.array(truck.track)], **style)
-            TimestampedStream(self._recording, truck.track_ns).log(f"map/track/{vehicle}", line)
-
-    def _draw_lane(self, bridge: str, vehicle: str, state: str, moment_ns: int) -> None:
-        """Draw a state of a truck's crossings of a bridge, from a time on."""
-        if bridge not in self._bridges:
-            return
-        entity = lane_entity(bridge, vehicle)
-        if (bridge, vehicle) not in self._lanes:
-            colours = [(*rgb(colour), 255) for colour in LANE_STATES.values()]
-            style = rr.StateConfiguration(values=list(LANE_STATES), colors=colours)
-            self._recording.log(entity, style, static=True)
-        before_ns = self._lanes.get((bridge, vehicle), 0)
-        if state == "on the bridge" and moment_ns < before_ns:
-            return  # it belongs to a crossing whose truck is already over the next bridge
-        moment_ns = max(moment_ns, before_ns + _LANE_STEP_NS)
-        self._lanes[bridge, vehicle] = moment_ns
-        TimestampedStream(self._recording, moment_ns).log(entity, rr.StateChange(state=state))
 
     def _draw_result(self, view: CrossingView, moment_ns: int) -> str:
         """Draw EI along the span with the roads below it; return sentences on the result."""
@@ -396,33 +303,24 @@ class LiveView:
             return
         self._bridges[bridge] = None
         self._layout_is_old = True
-        self._draw_text(bridge, self._latest_ns)
+        self._draw_text(bridge, self._time.latest_ns)
         found = self._site.get(bridge)
         if found is not None:
             log_surroundings(self._recording, found.on_map, {})
-            self._draw_bridge(found.on_map, None, self._latest_ns, doubtful=False)
+            self._draw_bridge(found.on_map, None, self._time.latest_ns, doubtful=False)
             for vehicle in self._trucks:
                 log_truck_style(self._recording, f"{plan_root(bridge)}/truck/{vehicle}", vehicle)
 
-    def _truck(self, vehicle: str) -> _Truck:
+    def _truck(self, vehicle: str) -> LiveTruck:
         truck = self._trucks.get(vehicle)
         if truck is None:
-            truck = self._trucks[vehicle] = _Truck()
+            truck = self._trucks[vehicle] = LiveTruck()
             self._layout_is_old = True
             log_marker(self._recording, f"map/position/{vehicle}")
             log_line(self._recording, f"vehicle/{vehicle}/speed", "speed", "#009E73")
             for bridge in self._bridges:
                 log_truck_style(self._recording, f"{plan_root(bridge)}/truck/{vehicle}", vehicle)
         return truck
-
-    def _near(self, places: FloatArray) -> list[str]:
-        """Return the bridges of the site file near the last of these positions."""
-        if not self._starts.size:
-            return []
-        north, east = ((self._starts - places[-1]) * M_PER_DEGREE).T
-        apart_m = np.hypot(north, east * np.cos(np.radians(places[-1, 0])))
-        names = list(self._site)
-        return [names[n] for n in np.flatnonzero(apart_m < _NEAR_M)]
 
     def _elements(self, crossing: CrossingResult) -> ElementGeometry | None:
         on_site = self._site.get(crossing.bridge)
@@ -434,14 +332,6 @@ class LiveView:
             self._elements_of_results[crossing.bridge] = elements
         return elements
 
-    def _note_time(self, time_ns: int) -> None:
-        if time_ns > self._latest_ns:
-            self._latest_ns, self._latest_s = time_ns, self._clock()
-
     def _moment_ns(self, vehicle: str, exit_ns: int) -> int:
         """Return the time of a result on the clock of the samples."""
-        now_ns = self._now_ns() if vehicle in self._trucks else 0
-        return now_ns if exit_ns < now_ns < exit_ns + _SOON_NS else exit_ns
-
-    def _lanes_end_ns(self, bridge: str) -> int:
-        return max((ns for (name, _), ns in self._lanes.items() if name == bridge), default=0)
+        return self._time.moment_ns(exit_ns, is_driving=vehicle in self._trucks)

@@ -40,7 +40,6 @@ LONG_CLASSES = {
     "services.execution.cluster:DaskExecutor": 273,
     "services.logger.writer:FileWriter": 395,
     "services.truck.spool:Spool": 260,
-    "services.viewer.live_view:LiveView": 315,
 }
 
 LONG_FUNCTIONS = {
