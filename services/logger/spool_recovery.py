@@ -115,7 +115,7 @@ class _Task:
 
 
 @dataclass
-class _SpooledTruck:
+class _Truck:
     ripe: dict[str, tuple[int, int]] = field(default_factory=dict)
     """Newest boot of each stream, and the sequence below which all are at least a round old."""
     turn: Counter[str] = field(default_factory=Counter)
@@ -149,7 +149,7 @@ class SpoolRecovery:
         self._gone = gone
         self._confirmed = confirmed
         self._lost = lost
-        self._trucks: dict[tuple[str, str], _SpooledTruck] = {}
+        self._trucks: dict[tuple[str, str], _Truck] = {}
         self._trucks_of: Counter[str] = Counter()
         self._complaints = RateLimitedLog(_log)
         self._listing = SpoolListing(bus, realms, self._complaints)
@@ -242,7 +242,7 @@ class SpoolRecovery:
         self._busy = self._busy or bool(todo)
         self._forgotten(truck, where, listed, newest)
 
-    def _truck(self, where: Key) -> _SpooledTruck | None:
+    def _truck(self, where: Key) -> _Truck | None:
         name = (where.realm, where.identifier)
         truck = self._trucks.get(name)
         if truck is None:
@@ -259,11 +259,11 @@ class SpoolRecovery:
                     where.identifier, _TRUCKS,
                 )  # fmt: skip
                 return None
-            truck = self._trucks[name] = _SpooledTruck()
+            truck = self._trucks[name] = _Truck()
             self._trucks_of[where.identifier] += 1
         return truck
 
-    def _turn(self, truck: _SpooledTruck, stream: str, boots: list[SpoolBoot]) -> list[SpoolBoot]:
+    def _turn(self, truck: _Truck, stream: str, boots: list[SpoolBoot]) -> list[SpoolBoot]:
         """Return the boots to compare now: the newest one, and others in turn."""
         earlier = boots[:-1]
         if len(earlier) > _BOOTS_AT_ONCE:
@@ -272,7 +272,7 @@ class SpoolRecovery:
             earlier = (earlier + earlier)[first : first + _BOOTS_AT_ONCE]
         return [*earlier, boots[-1]]
 
-    def _forgotten(self, truck: _SpooledTruck, where: Key, listed: set[int], newest: int) -> None:
+    def _forgotten(self, truck: _Truck, where: Key, listed: set[int], newest: int) -> None:
         """Give up the gaps of earlier boots that the truck has not listed for two rounds."""
         if self._with_holes is None:
             self._with_holes = {}
@@ -293,7 +293,7 @@ class SpoolRecovery:
                 self._lost(*name, first, last)
         truck.unlisted = {name for name in truck.unlisted if name[0] != where} | unlisted
 
-    def _ask(self, truck: _SpooledTruck, now_s: float) -> None:
+    def _ask(self, truck: _Truck, now_s: float) -> None:
         where, query = truck.todo.popleft()
         seen = self._seen.streams.get((where, query.boot_id), Intervals())
         missing = seen.missing_of([(query.first, query.last)])
@@ -316,9 +316,7 @@ class SpoolRecovery:
             return
         truck.task = _Task(where, query, handler, now_s + 2 * _PAGE_TIMEOUT_S)
 
-    def _read(
-        self, truck: _SpooledTruck, task: _Task, now_s: float, received: list[RawSample]
-    ) -> None:
+    def _read(self, truck: _Truck, task: _Task, now_s: float, received: list[RawSample]) -> None:
         for _ in range(_REPLIES_PER_STEP):
             try:
                 reply = task.handler.try_recv()
@@ -357,7 +355,7 @@ class SpoolRecovery:
                 if seen is None or identity.sequence not in seen:
                     received.append(RawSample(key(*task.where), payload, attachment, True, True))
 
-    def _page_complete(self, truck: _SpooledTruck, task: _Task, next_sequence: int | None) -> None:
+    def _page_complete(self, truck: _Truck, task: _Task, next_sequence: int | None) -> None:
         truck.task = None
         truck.failures = 0
         where, (boot_id, first, last) = task.where, task.query
@@ -370,18 +368,18 @@ class SpoolRecovery:
             for a, b in seen.missing_of([gap]):
                 self._lost(where, boot_id, a, b)
 
-    def _failed(self, truck: _SpooledTruck, task: _Task, now_s: float) -> None:
+    def _failed(self, truck: _Truck, task: _Task, now_s: float) -> None:
         truck.task = None
         truck.todo.appendleft((task.where, task.query))
         self._pause(truck, now_s)
 
-    def _pause(self, truck: _SpooledTruck, now_s: float) -> None:
+    def _pause(self, truck: _Truck, now_s: float) -> None:
         pause_s = min(_LONGEST_PAUSE_S, _FIRST_PAUSE_S * 2.0**truck.failures)
         truck.failures = min(truck.failures + 1, 10)
         truck.not_before_s = now_s + pause_s
 
 
-def _under_way(truck: _SpooledTruck) -> list[tuple[Key, SpoolQuery]]:
+def _under_way(truck: _Truck) -> list[tuple[Key, SpoolQuery]]:
     return [] if truck.task is None else [(truck.task.where, truck.task.query)]
 
 

@@ -22,7 +22,7 @@ def _speeds(text: str) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SurveyOptions:
+class SurveyPlanOptions:
     """A survey to forecast, and what is written."""
 
     site: Path = site_option(
@@ -75,7 +75,7 @@ class SurveyOptions:
     json: Path | None = output_option("JSON file of the whole plan", "OUT.json", SURVEY_JSON)
 
 
-def _survey(options: SurveyOptions) -> int:
+def _survey(options: SurveyPlanOptions) -> int:
     from schemas.site_file import load_site
     from services.common.errors import InputError
     from services.common.files import check_writable, write_atomically
@@ -122,7 +122,7 @@ def _survey(options: SurveyOptions) -> int:
 
 SURVEY: Final = Subcommand(
     "survey",
-    SurveyOptions,
+    SurveyPlanOptions,
     "plan a survey: expected accuracy, detection probability, most useful change",
     "driveby survey --site site.toml --loss 0.2 --crossings 12 --figure plan.png",
     _survey,
