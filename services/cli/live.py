@@ -279,18 +279,21 @@ def _add_spool(p: argparse.ArgumentParser) -> None:
 
 def _truck(options: argparse.Namespace) -> int:
     from services.truck.run import run
+    from services.truck.settings import TruckSettings
 
     return run(
-        recording=options.recording,
-        endpoint=options.endpoint or default_endpoint(options.tls),
-        realm=options.realm,
-        speed=options.speed,
-        vehicle=options.vehicle,
-        tls=options.tls,
-        spool=options.spool,
-        spool_budget_bytes=options.spool_budget << 20,
-        site=options.site,
-        skip_gaps=options.skip_gaps,
+        TruckSettings(
+            recording=options.recording,
+            endpoint=options.endpoint or default_endpoint(options.tls),
+            realm=options.realm,
+            speed=options.speed,
+            vehicle=options.vehicle,
+            tls=options.tls,
+            spool=options.spool,
+            spool_budget_bytes=options.spool_budget << 20,
+            site=options.site,
+            skip_gaps=options.skip_gaps,
+        )
     )
 
 
@@ -318,9 +321,10 @@ def add_gateway(commands: Any) -> None:
 
 
 def _gateway(options: argparse.Namespace) -> int:
-    from services.truck import ros2
+    from services.truck.ros2 import run
+    from services.truck.settings import GatewaySettings
 
-    return ros2.run(
+    asked = GatewaySettings(
         ros=options.ros,
         endpoint=options.endpoint or default_endpoint(options.tls),
         realm=options.realm,
@@ -329,8 +333,8 @@ def _gateway(options: argparse.Namespace) -> int:
         tls=options.tls,
         spool=options.spool,
         spool_budget_bytes=options.spool_budget << 20,
-        ready=_announced(options, f"ready, listening to ROS 2 at {options.ros}"),
     )
+    return run(asked, _announced(options, f"ready, listening to ROS 2 at {options.ros}"))
 
 
 def add_health(commands: Any) -> None:

@@ -11,7 +11,6 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Final, NamedTuple
 
 import zenoh
@@ -39,7 +38,8 @@ from services.drives.ros2_truck import Accel, Ros2Truck
 from services.truck.bounded_queue import BoundedQueue
 from services.truck.gateway import Connect, Gateway
 from services.truck.rmw_zenoh import decode_attachment, key_expression, type_and_hash
-from services.truck.spool import DEFAULT_BUDGET_BYTES, Spool
+from services.truck.settings import GatewaySettings
+from services.truck.spool import Spool
 
 _log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S: Final = 10.0
@@ -65,48 +65,37 @@ _MAX_REFUSED: Final = 100
 """Number of reported types and hashes, because a hostile sender could invent any number."""
 
 
-def run(
-    *,
-    ros: str,
-    endpoint: str,
-    realm: str,
-    site: Path,
-    vehicle: str | None,
-    tls: Path | None = None,
-    spool: Path | None = None,
-    spool_budget_bytes: int = DEFAULT_BUDGET_BYTES,
-    ready: Callable[[], None] = lambda: None,
-) -> int:
-    """Publish the messages of a ROS 2 truck at the router `ros` to `endpoint`, until stopped.
+def run(asked: GatewaySettings, ready: Callable[[], None] = lambda: None) -> int:
+    """Publish the messages of a ROS 2 truck to a router of the bus, until stopped.
 
-    No message ends it: unusable ones are counted, logged and published as an event.
-
-    `site` names the topics (`[ros2]`); `vehicle` chooses one of several trucks. With a folder
-    `spool` messages go to disk there first, and our router may come later (see `services.truck`);
-    that of ROS must be present. `ready` is called when all topics are subscribed to.
+    No message ends it: unusable ones are counted, logged and published as an event. With a spool
+    our router may come later; that of ROS must be present. `ready` is called when all topics are
+    subscribed to.
 
     Raise InputError for bad arguments, or a site file without the truck's `[ros2]`; FailureError if
     a router does not answer in time, or a logger did not confirm everything at the end.
     """
     check_rosbags()
+    realm, endpoint, tls = asked.realm, asked.endpoint, asked.tls
     try:
         check_realm(realm)
     except ValueError as error:
         raise InputError(str(error)) from None
-    known = load_site(site)
-    vehicle = vehicle_of(known, str(site), vehicle)
+    known = load_site(asked.site)
+    vehicle = vehicle_of(known, str(asked.site), asked.vehicle)
     # It is counted like others; the sensor's topic is free for another one.
-    truck = Ros2Truck(known, str(site), vehicle, wrong_rate=lambda error: None)
+    truck = Ros2Truck(known, str(asked.site), vehicle, wrong_rate=lambda error: None)
     check_speaks_for(tls, "truck", vehicle)
     with stopped_by_signals() as stop, contextlib.ExitStack() as stack:
-        ros_session = stack.enter_context(_open_ros(ros))
-        if spool is None:
+        ros_session = stack.enter_context(_open_ros(asked.ros))
+        if asked.spool is None:
             bus: zenoh.Session | Connect = stack.enter_context(
                 open_session(connect=endpoint, timeout_s=CONNECT_TIMEOUT_S, tls=tls)
             )
         else:
             bus = partial(open_session, connect=endpoint, timeout_s=0.0, tls=tls)
-        spooled = None if spool is None else Spool(spool, budget_bytes=spool_budget_bytes)
+        folder, budget_bytes = asked.spool, asked.spool_budget_bytes
+        spooled = None if folder is None else Spool(folder, budget_bytes=budget_bytes)
         gateway = Gateway(bus, realm, vehicle, spooled)
         stack.callback(gateway.close)
         out = _InfoFirstPublisher(gateway, vehicle_toml(known, vehicle), truck)

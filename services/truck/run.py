@@ -6,6 +6,7 @@ A program with its own sensors uses `gateway`; `run` plays a recording.
 import contextlib
 import logging
 import math
+import threading
 import time
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
@@ -42,7 +43,8 @@ from services.bus.session import open_session
 from services.common.errors import InputError
 from services.recordings.recording import check_message, read_messages
 from services.truck.gateway import Connect, Gateway
-from services.truck.spool import DEFAULT_BUDGET_BYTES, Spool
+from services.truck.settings import TruckSettings
+from services.truck.spool import Spool
 
 _log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S = 10.0
@@ -55,73 +57,46 @@ SUBSCRIBER_TIMEOUT_S = 1.0
 """Timeout for a subscriber; the cache serves late ones."""
 
 
-def run(
-    *,
-    recording: Path,
-    endpoint: str,
-    realm: str,
-    speed: float,
-    vehicle: str | None,
-    connect_timeout_s: float | None = CONNECT_TIMEOUT_S,
-    tls: Path | None = None,
-    spool: Path | None = None,
-    spool_budget_bytes: int = DEFAULT_BUDGET_BYTES,
-    site: Path | None = None,
-    skip_gaps: bool = False,
-) -> int:
+def run(asked: TruckSettings, *, connect_timeout_s: float | None = CONNECT_TIMEOUT_S) -> int:
     """Play one vehicle of a recording as a truck that drives now; return 0.
 
-    A folder of CSV files may replace the recording (docs/contract.md), with its `site`. The
-    playback is a new boot of that truck: new boot_id, sequences from 0, and times shifted as a
-    whole so that the recording ends now (at `speed` 1 or less: begins now). **Only the publication
-    is faster than real time, not the data**: rates and the time between samples stay those of the
-    recording, because they are physics. Shifted to the end, no stamp lies in the future. With
-    `skip_gaps` silences of the recording (between runs) are skipped, but stay in the data.
-
-    `vehicle` chooses one of several; `tls` is a folder of its credentials, see `open_session`. With
-    a folder `spool` every message goes to disk there first and stays until a logger has it (see
-    `services.truck.spool`). Messages of an earlier drive are offered too, and the router may come
-    later. Return when a logger has everything on disk (see `services.bus.delivery`).
+    A folder of CSV files may replace the recording (docs/contract.md). The playback is a new boot
+    of that truck: new boot_id, sequences from 0, and times shifted as a whole so that the recording
+    ends now (at `speed` 1 or less: begins now). **Only the publication is faster than real time,
+    not the data**: rates and the time between samples stay those of the recording, because they
+    are physics. Shifted to the end, no stamp lies in the future. With a spool messages of an
+    earlier drive are offered too, and the router may come later. Return when a logger has
+    everything on disk (see `services.bus.delivery`).
 
     Raise InputError if the recording is missing, invalid or without that vehicle, or the spool is
     another truck's; FailureError if the endpoint does not answer within `connect_timeout_s` (None:
     wait for ever; irrelevant with a spool), or the logger did not confirm everything.
     """
-    check_speed(speed)
-    try:
-        check_realm(realm)
-    except ValueError as error:
-        raise InputError(str(error)) from None
-    streams = _read_vehicle(recording, vehicle, site)
+    check_speed(asked.speed)
+    realm = _checked_realm(asked.realm)
+    streams = _read_vehicle(asked.recording, asked.vehicle, asked.site)
     vehicle = next(iter(streams.values()))[0].key.identifier
-    check_speaks_for(tls, "truck", vehicle)
+    check_speaks_for(asked.tls, "truck", vehicle)
     with stopped_by_signals() as stop, contextlib.ExitStack() as stack:
-        if spool is None:
+        if asked.spool is None:
             bus: zenoh.Session | Connect = stack.enter_context(
-                open_session(connect=endpoint, timeout_s=connect_timeout_s, tls=tls)
+                open_session(connect=asked.endpoint, timeout_s=connect_timeout_s, tls=asked.tls)
             )
         else:
-            bus = partial(open_session, connect=endpoint, timeout_s=0.0, tls=tls)
-        gateway = Gateway(bus, realm, vehicle, _open_spool(spool, spool_budget_bytes))
+            bus = partial(open_session, connect=asked.endpoint, timeout_s=0.0, tls=asked.tls)
+        spool = _open_spool(asked.spool, asked.spool_budget_bytes)
+        gateway = Gateway(bus, realm, vehicle, spool)
         stack.callback(gateway.close)
-        times = _times(streams, speed, skip_gaps=skip_gaps)
+        times = _times(streams, asked.speed, skip_gaps=asked.skip_gaps)
         _log_timing(times)
-        messages = _driven_now(recording, streams, realm, gateway.boot_id, times)
+        messages = _driven_now(asked.recording, streams, realm, gateway.boot_id, times)
         keys = [queue[0].key for queue in streams.values()]
         if gateway.is_online and not declare_and_wait(
             gateway.publisher, keys, SUBSCRIBER_TIMEOUT_S
         ):
             # A real truck continues as well; its cache serves late subscribers.
             gateway.log.warning("no subscriber to %s in realm %s yet", gateway.vehicle, realm)
-
-        def put(message: Message) -> None:
-            identity = Identity(message.boot_id, message.sequence)
-            gateway.put(message.key.stream, message.payload, identity, patient=True)
-
-        longest_gap_s = GAP_S if skip_gaps else math.inf
-        sent = publish_paced(
-            messages, put, gateway.delivery, speed=speed, stop=stop, longest_gap_s=longest_gap_s
-        )
+        sent = _publish(gateway, messages, asked, stop)
         confirm(gateway.delivery, sent)
         if gateway.is_online:
             gateway.log.info(
@@ -130,9 +105,31 @@ def run(
         else:
             gateway.log.warning(
                 "%d messages of %s are in the spool, none were published: no router answered at %s",
-                sent, gateway.vehicle, endpoint,
+                sent, gateway.vehicle, asked.endpoint,
             )  # fmt: skip
     return 0
+
+
+def _checked_realm(realm: str) -> str:
+    try:
+        return check_realm(realm)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+def _publish(
+    gateway: Gateway, messages: Iterable[Message], asked: TruckSettings, stop: threading.Event
+) -> int:
+    """Publish the messages at their pace; return how many."""
+
+    def put(message: Message) -> None:
+        identity = Identity(message.boot_id, message.sequence)
+        gateway.put(message.key.stream, message.payload, identity, patient=True)
+
+    longest_gap_s = GAP_S if asked.skip_gaps else math.inf
+    return publish_paced(
+        messages, put, gateway.delivery, speed=asked.speed, stop=stop, longest_gap_s=longest_gap_s
+    )
 
 
 def _open_spool(folder: Path | None, budget_bytes: int) -> Spool | None:

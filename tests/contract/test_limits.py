@@ -63,7 +63,6 @@ LONG_FUNCTIONS = {
     "services.simulation.two_sided:cross": 61,
     "services.simulation.wide_cases:draw_wide": 78,
     "services.simulation.out_of_model:draw_out_of_model": 83,
-    "services.truck.run:run": 76,
     "studies.paper.scenarios:run_scenario": 71,
 }
 
@@ -102,8 +101,6 @@ MANY_ARGUMENTS = {
     "services.simulation.two_sided:_march": 19,
     "services.simulation.two_sided_surface:_heights": 9,
     "services.simulation.wide_crossings:road_under": 8,
-    "services.truck.run:run": 11,
-    "services.truck.ros2:run": 9,
     "studies.paper.scenarios:run_scenario": 8,
     "services.viewer.live:live_command": 8,
     "services.viewer.rerun_file:write_rrd": 8,

@@ -45,6 +45,7 @@ if "recordings" in arguments:
 SETTINGS = {
     "services.logger": "LoggerSettings",
     "services.replay": "ReplaySettings",
+    "services.truck": "TruckSettings",
     "services.worker": "WorkerSettings",
 }
 if module == "services.logger":

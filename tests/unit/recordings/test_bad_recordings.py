@@ -23,6 +23,7 @@ from services.recordings.writer import write_recording
 from services.replay.run import run as replay
 from services.replay.settings import ReplaySettings
 from services.truck.run import run as truck
+from services.truck.settings import TruckSettings
 
 WALL_NS = 1_767_225_600_000_000_000
 ACCEL = Key("sim-x", "vehicle", "truck-1", "accel")
@@ -80,7 +81,8 @@ def replayed(path: Path) -> None:
 
 
 def driven(path: Path) -> None:
-    truck(recording=path, endpoint="tcp/127.0.0.1:1", realm="sim-y", speed=1000.0, vehicle=None)
+    asked = TruckSettings(recording=path, endpoint="tcp/127.0.0.1:1", realm="sim-y", speed=1000.0)
+    truck(asked)
 
 
 @pytest.mark.parametrize("command", [replayed, driven])
