@@ -18,33 +18,30 @@ from functools import partial
 from pathlib import Path
 from typing import Final, NoReturn
 
+from services.cli.announcing import subject_of
 from services.cli.closed_pipe import outliving_output, to_null
 from services.cli.commands.alarm import ALARM
 from services.cli.commands.catalog import CATALOG
 from services.cli.commands.certs import CERTS
 from services.cli.commands.check import CHECK
 from services.cli.commands.cluster import CLUSTER
+from services.cli.commands.demo import DEMO
 from services.cli.commands.export import EXPORT
 from services.cli.commands.fuse import FUSE
+from services.cli.commands.gateway import GATEWAY
+from services.cli.commands.health import HEALTH
 from services.cli.commands.history import HISTORY
 from services.cli.commands.identify import IDENTIFY
 from services.cli.commands.info import INFO
+from services.cli.commands.logger import LOGGER
 from services.cli.commands.recover import RECOVER
 from services.cli.commands.replay import REPLAY
 from services.cli.commands.survey import SURVEY
+from services.cli.commands.truck import TRUCK
 from services.cli.commands.view import VIEW
 from services.cli.commands.watch import WATCH
+from services.cli.commands.worker import WORKER
 from services.cli.completion import SHELLS, completion
-from services.cli.live import (
-    SERVICES,
-    add_demo,
-    add_gateway,
-    add_health,
-    add_logger,
-    add_truck,
-    add_worker,
-    subject_of,
-)
 from services.cli.needs import check_needs
 from services.cli.offline import add_import
 from services.cli.parsing import Files, Handler, Parser, add_common, files_of
@@ -57,6 +54,8 @@ from services.common.log_lines import configure_logging
 from services.common.outputs import declared
 
 _OBJECTS_BETWEEN_LOOKS: Final = 20_000
+_SERVICES: Final = tuple(one.handle for one in (LOGGER, WORKER, TRUCK, GATEWAY, CLUSTER))
+"""Handlers that run until they are stopped, and whose log is their only output."""
 _COUNTS_AT_EXIT: Final = ("_duckdb", "duckdb")
 """Modules made with nanobind, whose types are in cycles that a last collection frees."""
 _COMMANDS: Final = (
@@ -75,14 +74,14 @@ _COMMANDS: Final = (
     add_validate,
     RECOVER.add,
     VIEW.add,
-    add_demo,
-    add_logger,
-    add_worker,
-    add_truck,
-    add_gateway,
+    DEMO.add,
+    LOGGER.add,
+    WORKER.add,
+    TRUCK.add,
+    GATEWAY.add,
     REPLAY.add,
     WATCH.add,
-    add_health,
+    HEALTH.add,
     CLUSTER.add,
     CERTS.add,
 )
@@ -131,7 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _print_error(str(error), EXIT_BAD_INPUT)
     is_json = options.log_format == "json"
     # The log is a service's only output.
-    verbose = options.verbose or options.handler in (*SERVICES, CLUSTER.handle)
+    verbose = options.verbose or options.handler in _SERVICES
     level = logging.INFO if verbose else logging.WARNING
     configure_logging(options.log_format, level, subject_of(options))
     fail = partial(_print_error, is_json=is_json)

@@ -3,12 +3,15 @@
 import argparse
 from collections.abc import Callable
 from dataclasses import MISSING, fields
+from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar
 
+from services.cli.announcing import announcement
 from services.cli.parsing import command
 from services.common.options import OPTION, Option
 
 _Asked = TypeVar("_Asked")
+Announce = Callable[[str], Callable[[], None]]
 
 
 class Subcommand(NamedTuple, Generic[_Asked]):
@@ -28,6 +31,26 @@ class Subcommand(NamedTuple, Generic[_Asked]):
     def handle(self, given: argparse.Namespace) -> int:
         """Run the command with what was given."""
         return self.run(_filled(self.options, given))
+
+
+class ServiceCommand(NamedTuple, Generic[_Asked]):
+    """A command that runs until it is stopped, and whose log is its only output."""
+
+    name: str
+    options: type[_Asked]
+    summary: str
+    example: str
+    run: Callable[[_Asked, Announce], int]
+    """Function of the options, and of one that makes an announcement of a line."""
+
+    def add(self, commands: Any) -> None:
+        """Add the command to a parser."""
+        parser = command(commands, self.name, self.handle, self.summary, self.example)
+        _add_fields(parser, self.options)
+
+    def handle(self, given: argparse.Namespace) -> int:
+        """Run the command with what was given."""
+        return self.run(_filled(self.options, given), partial(announcement, given))
 
 
 def _add_fields(parser: argparse.ArgumentParser, options: Any) -> None:
@@ -56,11 +79,8 @@ def _filled(options: type[_Asked], given: argparse.Namespace) -> _Asked:
     for one in fields(options):  # type: ignore[arg-type]
         option: Option = one.metadata[OPTION]
         flag = option.flags[-1] if option.flags else ""
-        name = flag.lstrip("-").replace("-", "_") or one.name
-        value = getattr(given, name)
-        values[one.name] = (
-            tuple(value or ())
-            if isinstance(value, list) or (value is None and one.default == ())
-            else value
-        )
+        value = getattr(given, flag.lstrip("-").replace("-", "_") or one.name)
+        if value is None and isinstance(one.default, tuple):
+            value = one.default  # it may be given repeatedly, and was not
+        values[one.name] = tuple(value) if isinstance(value, list) else value
     return options(**values)

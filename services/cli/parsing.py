@@ -9,11 +9,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn
 
-from services.common.endpoints import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT
 from services.common.errors import InputError
 from services.common.kinds import MCAP, Kind
 from services.common.options import (
-    METHODS,
+    RECORDINGS,
     OutputFile,
     folder_here,
     number,
@@ -23,7 +22,6 @@ from services.common.options import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-RECORDINGS: Final = Path("recordings")
 SCENARIOS: Final = range(1, 13)
 CERTIFICATES: Final = RECORDINGS / "certificates"
 EXIT_SOMETHING_LOST: Final = 3
@@ -188,17 +186,6 @@ def add_output_folder(p: Any, option: str, text: str, *, required: bool = False)
     p.add_argument(option, type=folder_here, required=required, metavar="DIR", help=text)
 
 
-def add_folder(p: argparse.ArgumentParser, text: str) -> None:
-    """Add `--folder`: where a service writes its files."""
-    p.add_argument(
-        "--folder",
-        type=Path,
-        default=RECORDINGS,
-        metavar="DIR",
-        help=f"{text} (default: recordings)",
-    )
-
-
 def add_certificates(p: Any, text: str) -> None:
     """Add `--validations`: a folder of validation records."""
     p.add_argument("--validations", type=Path, metavar="DIR", help=text)
@@ -216,55 +203,6 @@ def add_noise(p: argparse.ArgumentParser, text: str, default: float = 0.0) -> No
     p.add_argument(
         "--noise", type=number("a noise density", low=0, high=1e6), default=default, help=text
     )
-
-
-def add_speed(p: Any, default: float, zero: str = "") -> None:
-    """Add `--speed` as a multiple of the original one; `zero` explains the value 0."""
-    p.add_argument(
-        "--speed",
-        type=number("a factor", low=0 if zero else 1e-3, high=1e6),
-        default=default,
-        metavar="FACTOR",
-        help=f"speed over real time{', ' + zero if zero else ''} (default: {default:g})",
-    )
-
-
-def add_method(p: argparse.ArgumentParser) -> None:
-    """Add `--method` of identification."""
-    p.add_argument(
-        "--method",
-        choices=METHODS,
-        default=METHODS[0],
-        help="pre: with intervals, for real sensors; least-squares: for simulations without noise; "
-        f"random-walk: the paper's search (default: {METHODS[0]})",
-    )
-
-
-def add_endpoint(p: Any) -> None:
-    """Add `--endpoint` and `--tls`: address of the bus, and credentials."""
-    p.add_argument("--endpoint", help=f"address of the logger (default: {DEFAULT_ENDPOINT})")
-    add_tls(p)
-
-
-def add_tls(p: Any) -> None:
-    """Add `--tls`: a folder of credentials."""
-    p.add_argument(
-        "--tls",
-        type=Path,
-        metavar="FOLDER",
-        help="credentials made by `driveby certs`; "
-        f"the default address is {DEFAULT_TLS_ENDPOINT} then",
-    )
-
-
-def add_realm(p: Any) -> None:
-    """Add `--realm`."""
-    p.add_argument("--realm", default="live", help="realm on the bus (default: live)")
-
-
-def add_id(p: argparse.ArgumentParser, default: str) -> None:
-    """Add `--id` of a service."""
-    p.add_argument("--id", default=default, help=f"name of this service (default: {default})")
 
 
 def scenario(text: str) -> int:

@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 from services.common.endpoints import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT
 from services.common.kinds import Kind
 
+RECORDINGS: Final = Path("recordings")
 METHODS: Final = ("pre", "least-squares", "random-walk")
 OPTION: Final = "option"
 """Key of a field's metadata under which its `Option` is."""
@@ -125,6 +126,22 @@ def method_option() -> Any:
     )
 
 
+def folder_option(text: str) -> Any:
+    """Return `--folder`: where a service writes its files."""
+    return opt(f"{text} (default: recordings)", Path, default=RECORDINGS, metavar="DIR")
+
+
+def id_option(default: str) -> Any:
+    """Return `--id` of a service."""
+    text = f"name of this service (default: {default})"
+    return opt(text, flags=("--id",), default=default)
+
+
+def noise_option(text: str, default: float = 0.0) -> Any:
+    """Return `--noise` of the accelerometers."""
+    return opt(text, number("a noise density", low=0, high=1e6), default=default)
+
+
 def seed_option() -> Any:
     """Return `--seed` of all random numbers."""
     return opt("seed of all random numbers (default: 1)", whole("a seed", 0), default=1)
@@ -137,7 +154,7 @@ def force_option() -> Any:
 
 def validations_option(text: str) -> Any:
     """Return `--validations`: a folder of validation records."""
-    return opt(text, Path, metavar="DIR")
+    return opt(text, Path, flags=("--validations",), metavar="DIR")
 
 
 def baseline_option() -> Any:

@@ -85,12 +85,12 @@ def run(asked: LoggerSettings, ready: Callable[[], None] | None = None) -> int:
     site file; FailureError if the address is in use, the disk has too little space, or writing
     failed.
     """
-    limits = asked.limits or RotationLimits()
+    limits = asked.limits
     place, realms = _check(asked, limits)
     own = OwnEvents(asked.service_id, time.time_ns())
     with (
         stopped_by_signals(on_second=leave_at_once) as stop,
-        open_session(listen=asked.listen, tls=asked.tls, insecure=asked.insecure) as bus,
+        open_session(listen=asked.address, tls=asked.tls, insecure=asked.insecure) as bus,
     ):
         writer = FileWriter(place, limits, own=own)
         try:

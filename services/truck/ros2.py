@@ -76,7 +76,7 @@ def run(asked: GatewaySettings, ready: Callable[[], None] = lambda: None) -> int
     a router does not answer in time, or a logger did not confirm everything at the end.
     """
     check_rosbags()
-    realm, endpoint, tls = asked.realm, asked.endpoint, asked.tls
+    realm, endpoint, tls = asked.realm, asked.address, asked.tls
     try:
         check_realm(realm)
     except ValueError as error:
@@ -94,7 +94,7 @@ def run(asked: GatewaySettings, ready: Callable[[], None] = lambda: None) -> int
             )
         else:
             bus = partial(open_session, connect=endpoint, timeout_s=0.0, tls=tls)
-        folder, budget_bytes = asked.spool, asked.spool_budget_bytes
+        folder, budget_bytes = asked.spool, asked.spool_budget << 20
         spooled = None if folder is None else Spool(folder, budget_bytes=budget_bytes)
         gateway = Gateway(bus, realm, vehicle, spooled)
         stack.callback(gateway.close)

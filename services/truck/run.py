@@ -80,11 +80,11 @@ def run(asked: TruckSettings, *, connect_timeout_s: float | None = CONNECT_TIMEO
     with stopped_by_signals() as stop, contextlib.ExitStack() as stack:
         if asked.spool is None:
             bus: zenoh.Session | Connect = stack.enter_context(
-                open_session(connect=asked.endpoint, timeout_s=connect_timeout_s, tls=asked.tls)
+                open_session(connect=asked.address, timeout_s=connect_timeout_s, tls=asked.tls)
             )
         else:
-            bus = partial(open_session, connect=asked.endpoint, timeout_s=0.0, tls=asked.tls)
-        spool = _open_spool(asked.spool, asked.spool_budget_bytes)
+            bus = partial(open_session, connect=asked.address, timeout_s=0.0, tls=asked.tls)
+        spool = _open_spool(asked.spool, asked.spool_budget << 20)
         gateway = Gateway(bus, realm, vehicle, spool)
         stack.callback(gateway.close)
         times = _times(streams, asked.speed, skip_gaps=asked.skip_gaps)
@@ -105,7 +105,7 @@ def run(asked: TruckSettings, *, connect_timeout_s: float | None = CONNECT_TIMEO
         else:
             gateway.log.warning(
                 "%d messages of %s are in the spool, none were published: no router answered at %s",
-                sent, gateway.vehicle, asked.endpoint,
+                sent, gateway.vehicle, asked.address,
             )  # fmt: skip
     return 0
 

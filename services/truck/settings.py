@@ -1,46 +1,85 @@
-"""Settings of a played truck and of the ROS 2 gateway."""
+"""Options of `driveby truck` and `driveby gateway`."""
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from services.truck.spool import DEFAULT_BUDGET_BYTES
+from services.common.endpoints import default_endpoint
+from services.common.options import (
+    endpoint_option,
+    flag,
+    opt,
+    positional,
+    realm_option,
+    site_option,
+    speed_option,
+    tls_option,
+    whole,
+)
+
+
+def _spool_option() -> Any:
+    text = "folder that keeps every message until a logger has it; one for each truck"
+    return opt(text, Path, metavar="DIR")
+
+
+def _spool_budget_option() -> Any:
+    return opt(
+        "size limit of the spool in MiB; beyond it the oldest messages are dropped (default: 4096)",
+        whole("MiB", 1, 1 << 30),
+        default=4096,
+        metavar="MIB",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class TruckSettings:
     """A recording and the bus on which it is played as a truck that drives now."""
 
-    recording: Path
-    """Recording, or a folder of CSV files with a `site`."""
-    endpoint: str
-    realm: str
-    speed: float = 1.0
-    """Speed of the publication over real time, never of the data; 0: as fast as possible."""
-    vehicle: str | None = None
-    """One of several vehicles."""
-    tls: Path | None = None
-    """Folder of its credentials, see `open_session`."""
-    spool: Path | None = None
-    """Folder that keeps every message until a logger has it, see `services.truck.spool`."""
-    spool_budget_bytes: int = DEFAULT_BUDGET_BYTES
-    site: Path | None = None
-    skip_gaps: bool = False
-    """Whether silences between runs are skipped; they stay in the data."""
+    recording: Path = positional(
+        "measurements to publish: a recording, or a folder of CSV files with --site",
+        Path,
+        metavar="REC.mcap | DIR",
+    )
+    site: Path | None = site_option(
+        "site file for a folder of CSV files (a recording carries its own)"
+    )
+    spool: Path | None = _spool_option()
+    spool_budget: int = _spool_budget_option()
+    endpoint: str | None = endpoint_option()
+    tls: Path | None = tls_option()
+    realm: str = realm_option()
+    speed: float = speed_option(1.0)
+    skip_gaps: bool = flag("skip gaps of more than 2 s, as between runs")
+    vehicle: str | None = opt(
+        "identifier of the vehicle to publish, where there are several", metavar="ID"
+    )
+
+    @property
+    def address(self) -> str:
+        """Address of the bus."""
+        return self.endpoint or default_endpoint(self.tls)
 
 
 @dataclass(frozen=True, kw_only=True)
 class GatewaySettings:
     """A router of ROS 2, the truck behind it, and the bus to which its data are published."""
 
-    ros: str
-    """Address of the router of ROS 2."""
-    endpoint: str
-    realm: str
-    site: Path
-    """Site file with the topics of the truck (`[ros2]`)."""
-    vehicle: str | None = None
-    """One of several trucks."""
-    tls: Path | None = None
-    spool: Path | None = None
-    """Folder that keeps every message until a logger has it, see `services.truck.spool`."""
-    spool_budget_bytes: int = DEFAULT_BUDGET_BYTES
+    what: str = positional("ros2: with rmw_zenoh, see docs/truck.md", choices=("ros2",))
+    ros: str = opt(
+        "address of rmw_zenoh's router, e.g. tcp/127.0.0.1:7447",
+        required=True,
+        metavar="ENDPOINT",
+    )
+    site: Path = site_option("site file of the truck, with its topics in [ros2]", required=True)
+    vehicle: str | None = opt("identifier of the site's vehicle", metavar="ID")
+    spool: Path | None = _spool_option()
+    spool_budget: int = _spool_budget_option()
+    endpoint: str | None = endpoint_option()
+    tls: Path | None = tls_option()
+    realm: str = realm_option()
+
+    @property
+    def address(self) -> str:
+        """Address of the bus."""
+        return self.endpoint or default_endpoint(self.tls)

@@ -83,7 +83,7 @@ def run(asked: WorkerSettings, ready: Callable[[], None] | None = None) -> int:
         execution = stack.enter_context(
             ProcessExecutor(asked.processes, report=report, limits=limits)
         )
-        bus = wait_for_router(asked.endpoint, asked.tls, stop.is_set)
+        bus = wait_for_router(asked.address, asked.tls, stop.is_set)
         if bus is None:
             return 0
         stack.enter_context(bus)
@@ -111,7 +111,7 @@ def run(asked: WorkerSettings, ready: Callable[[], None] | None = None) -> int:
             publisher.close()
         if receiver.has_failed:
             files.abandon()
-            raise FailureError(f"{asked.endpoint}: the connection to the bus failed, see the log")
+            raise FailureError(f"{asked.address}: the connection to the bus failed, see the log")
         files.finish()
     return 0
 
@@ -124,17 +124,18 @@ def _check(asked: WorkerSettings) -> None:
     except ValueError as error:
         raise InputError(str(error)) from None
     check_speaks_for(asked.tls, "worker", asked.service_id)
-    if asked.records_are_required and not METHODS[asked.method].has_noise_model:
+    if asked.records_are_required and not METHODS[asked.search_method].has_noise_model:
+        method = asked.search_method.replace("_", "-")
         raise InputError(
-            f"--method {asked.method.replace('_', '-')}: has no certificates, which realm live and "
-            "--validate-first ask for; take pre, or --skip-validation"
+            f"--method {method}: has no certificates, which realm live and --validate-first "
+            "ask for; take pre, or --skip-validation"
         )
 
 
 def _search(asked: WorkerSettings) -> Search:
     text = read_site_text(asked.site)
     site = parse_site(text, str(asked.site))
-    settings = IdentificationSettings.model_validate({"method": asked.method})
+    settings = IdentificationSettings.model_validate({"method": asked.search_method})
     header = header_of(site, settings, time.time())
     fusing = Fusing(baselines_of(site, asked.site.parent), threads=settings.threads)
     certificates = asked.certificates or asked.folder / "certificates"

@@ -1,44 +1,89 @@
-"""Settings of the worker, for its parser too: no library is imported."""
+"""Options of `driveby worker`."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
+from services.common.endpoints import default_endpoint
+from services.common.options import (
+    endpoint_option,
+    flag,
+    folder_option,
+    id_option,
+    method_option,
+    number,
+    opt,
+    output_option,
+    realm_option,
+    site_option,
+    tls_option,
+    validations_option,
+    whole,
+)
 from services.execution.hang_watchdog import LIMIT_S
 
-RECORDINGS_DAYS: Final = 2.0
-"""Age in days up to which recordings are scanned; older crossings need a request."""
+_VALIDATION = "validation"
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorkerSettings:
     """Settings of one run of the worker."""
 
-    endpoint: str
-    realm: str
-    site: Path
-    folder: Path
-    """Folder of the results, in a folder of the realm."""
-    file: Path | None = None
-    """Single new file for the results, instead of one in `folder`."""
-    method: str
-    service_id: str
-    tls: Path | None = None
-    """Folder of credentials, see `open_session`."""
-    processes: int = 1
-    """Number of processes, each of which identifies one crossing at a time."""
-    limit_s: float = LIMIT_S
-    """Processor time in s after which an identification is ended."""
-    certificates: Path | None = None
-    """Folder of validation records, by default one in `folder`."""
-    validate: bool | None = None
-    """Whether crossings wait for a validation record; None: in realm `live` only."""
-    recordings: Path | None = None
-    """Folder of the logger's recordings, by default `folder`."""
-    recordings_days: float = RECORDINGS_DAYS
-    """Age in days of the oldest recordings that are read; 0: none."""
+    endpoint: str | None = endpoint_option()
+    tls: Path | None = tls_option()
+    realm: str = realm_option()
+    site: Path = site_option("trucks and bridges", required=True)
+    folder: Path = folder_option("folder of the results")
+    file: Path | None = output_option("single new file for the results (and .json)", "RESULTS.mcap")
+    method: str = method_option()
+    processes: int = opt(
+        "number of crossings identified at once, in addition to the listening process (default: 1)",
+        whole("processes", 1, 256),
+        default=1,
+        metavar="N",
+    )
+    limit_s: float = opt(
+        "CPU time limit per crossing in s; on excess the crossing is retried once (default: 900)",
+        number("seconds", low=1, high=1e6),
+        flags=("--cpu-limit",),
+        default=LIMIT_S,
+        metavar="S",
+    )
+    service_id: str = id_option("worker")
+    validate_first: bool = flag(
+        "identify only truck and bridge pairs that have passed a site validation by "
+        "simulation (always so in realm live)",
+        alternatives=_VALIDATION,
+    )
+    skip_validation: bool = flag(
+        "identify in realm live without site validation", alternatives=_VALIDATION
+    )
+    certificates: Path | None = validations_option(
+        "folder of certificates (default: certificates in --folder)"
+    )
+    recordings: Path | None = opt(
+        "folder of the logger's recordings, for crossings that trucks no longer send "
+        "(default: --folder)",
+        Path,
+        metavar="DIR",
+    )
+    recordings_days: float = opt(
+        "age in days of the oldest recordings to catch up from (default: 2; 0: none)",
+        number("days", low=0, high=3650),
+        default=2.0,
+        metavar="DAYS",
+    )
+
+    @property
+    def address(self) -> str:
+        """Address of the bus."""
+        return self.endpoint or default_endpoint(self.tls)
+
+    @property
+    def search_method(self) -> str:
+        """Name of the method in settings and results."""
+        return self.method.replace("-", "_")
 
     @property
     def records_are_required(self) -> bool:
         """Whether a crossing waits for a validation record of its truck and bridge."""
-        return self.realm == "live" if self.validate is None else self.validate
+        return self.validate_first or (self.realm == "live" and not self.skip_validation)

@@ -253,7 +253,7 @@ def log(endpoint: str, folder: Path, rotate_minutes: float) -> int:
             file=None,
             realms=("*",),
             site=None,
-            limits=writer.RotationLimits(age_s=rotate_minutes * 60.0),
+            rotate_minutes=rotate_minutes,
         ),
         ready=lambda: print("ready", flush=True),
     )

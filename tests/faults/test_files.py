@@ -370,7 +370,7 @@ def test_the_logger_does_not_start_without_room(tmp_path: Path) -> None:
                 file=None,
                 realms=("*",),
                 site=None,
-                limits=RotationLimits(min_free_bytes=1 << 60),
+                min_free=1e12,
             )
         )
     assert not (tmp_path / "new").exists()

@@ -585,7 +585,7 @@ def test_no_command_replaces_a_recording_by_accident_or_while_it_is_written(
 
 @pytest.mark.parametrize(
     ("given", "realms"),
-    [([], ("live",)), (["--realm", "sim-a", "--realm", "replay-*"], ["sim-a", "replay-*"])],
+    [([], ("live",)), (["--realm", "sim-a", "--realm", "replay-*"], ("sim-a", "replay-*"))],
 )
 def test_logger_records_the_chosen_realms(
     monkeypatch: pytest.MonkeyPatch, given: list[str], realms: object

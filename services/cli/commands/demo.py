@@ -1,0 +1,43 @@
+"""The command `driveby demo`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from services.cli.parser import Subcommand
+from services.cli.parsing import a_console
+from services.common.options import flag, noise_option, output_folder_option, speed_option
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions:
+    """How the demonstration runs, and where to it writes."""
+
+    out: Path | None = output_folder_option("new folder for the outputs")
+    speed: float = speed_option(4.0)
+    noise: float = noise_option(
+        "accelerometers' noise density in µg/√Hz; 0: all exact, least squares (default: 25)", 25.0
+    )
+    live: bool = flag("show it live in the viewer")
+    web: bool = flag("show it live in the browser")
+
+
+def _demo(asked: DemoOptions) -> int:
+    from services.cli.demo import demo_command
+
+    return demo_command(
+        out=asked.out,
+        speed=asked.speed,
+        noise=asked.noise,
+        console=a_console(),
+        live="web" if asked.web else "window" if asked.live else None,
+    )
+
+
+DEMO: Final = Subcommand(
+    "demo",
+    DemoOptions,
+    "simulate, publish, record, identify and draw one crossing",
+    "driveby demo --speed 4",
+    _demo,
+)

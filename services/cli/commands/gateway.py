@@ -1,0 +1,21 @@
+"""The command `driveby gateway`."""
+
+from typing import Final
+
+from services.cli.parser import Announce, ServiceCommand
+from services.truck.settings import GatewaySettings
+
+
+def _gateway(asked: GatewaySettings, announce: Announce) -> int:
+    from services.truck.ros2 import run
+
+    return run(asked, announce(f"ready, listening to ROS 2 at {asked.ros}"))
+
+
+GATEWAY: Final = ServiceCommand(
+    "gateway",
+    GatewaySettings,
+    "publish the data of a ROS 2 truck on the bus",
+    "driveby gateway ros2 --ros tcp/127.0.0.1:7447 --endpoint tcp/office:7447 --site site.toml",
+    _gateway,
+)

@@ -1,0 +1,21 @@
+"""The command `driveby truck`."""
+
+from typing import Final
+
+from services.cli.parser import Announce, ServiceCommand
+from services.truck.settings import TruckSettings
+
+
+def _truck(asked: TruckSettings, announce: Announce) -> int:
+    from services.truck.run import run
+
+    return run(asked)
+
+
+TRUCK: Final = ServiceCommand(
+    "truck",
+    TruckSettings,
+    "publish a recording as a truck that drives now",
+    "driveby truck run.mcap --speed 4",
+    _truck,
+)
