@@ -22,8 +22,8 @@ from schemas.site import Bridge, Site
 from schemas.validation_records import VehicleBridgePair
 from services.catalogue.contents import summarise_recording
 from services.cli.bridge_table import print_bridge, print_elements
-from services.cli.commands.identify import IdentifyOptions
 from services.cli.parsing import CERTIFICATES
+from services.cli.settings import IdentifyOptions
 from services.common.errors import FailureError, InputError
 from services.common.files import (
     check_folder_writable,

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from services.cli.commands.identify import IdentifyOptions
 from services.cli.parsing import option_of
+from services.cli.settings import IdentifyOptions
 from services.common.errors import InputError
 
 if TYPE_CHECKING:

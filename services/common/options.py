@@ -131,6 +131,12 @@ def folder_option(text: str) -> Any:
     return opt(f"{text} (default: recordings)", Path, default=RECORDINGS, metavar="DIR")
 
 
+def history_option() -> Any:
+    """Return `--history`: the folder of a history."""
+    text = "folder of the history (default: history)"
+    return opt(text, Path, default=Path("history"), metavar="DIR")
+
+
 def id_option(default: str) -> Any:
     """Return `--id` of a service."""
     text = f"name of this service (default: {default})"

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from services.cli.commands.history import alarm_line, history_option
+from services.cli.alarm_line import alarm_line
 from services.cli.parser import Subcommand
 from services.common.endpoints import default_endpoint
 from services.common.errors import InputError
 from services.common.options import (
     endpoint_option,
     flag,
+    history_option,
     number,
     opt,
     positional,

@@ -4,17 +4,18 @@ import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
+from services.cli.alarm_line import alarm_line, day
 from services.cli.parser import Subcommand
 from services.cli.parsing import EXIT_SOMETHING_LOST, a_console
-from services.common.errors import InputError, one_line
+from services.common.errors import InputError
 from services.common.kinds import HISTORY_CSV, HISTORY_JSON, RERUN
 from services.common.options import (
     file_option,
     flag,
+    history_option,
     opt,
     output_folder_option,
     output_option,
@@ -22,19 +23,11 @@ from services.common.options import (
 )
 
 if TYPE_CHECKING:
-    from schemas.alarms import Alarm
     from schemas.results import Results
     from services.history.bridge_history import BridgeHistory, HistoryEntry
     from services.history.periods import FusedPeriod, Unit
 
-HISTORY_FOLDER: Final = Path("history")
 _ADD = "add"
-
-
-def history_option() -> Any:
-    """Return `--history`: the folder of a history."""
-    text = "folder of the history (default: history)"
-    return opt(text, Path, default=HISTORY_FOLDER, metavar="DIR")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,7 +211,7 @@ def _lines(past: "BridgeHistory") -> Iterator[str]:
     for one in periods:
         warm = "     " if one.temperature_deg_c is None else f"{one.temperature_deg_c:5.1f}"
         used = 0 if one.state is None else len(one.state.crossings_used)
-        head = f"{_day(one.begin_s)}  {used:>3} of {one.crossings:<3} {warm}"
+        head = f"{day(one.begin_s)}  {used:>3} of {one.crossings:<3} {warm}"
         if one.state is None or not one.state.elements:
             yield f"{head}  none of them could be used"
             continue
@@ -231,17 +224,6 @@ def _lines(past: "BridgeHistory") -> Iterator[str]:
         yield alarm_line(alarm)
     for said in statements(past):
         yield said.text
-
-
-def alarm_line(alarm: "Alarm") -> str:
-    """Return the printed line of an alarm."""
-    note = alarm.acknowledged
-    state = "stands" if note is None else f"acknowledged by {note.by} on {_day(note.time)}"
-    said = f": {note.note}" if note is not None and note.note else ""
-    return one_line(
-        f"alarm {alarm.alarm_id} of {alarm.bridge}, raised {_day(alarm.raised)}, {state}{said}; "
-        f"{alarm.sentence()}"
-    )
 
 
 def _csv(periods: "Sequence[FusedPeriod]") -> Iterator[str]:
@@ -295,10 +277,6 @@ def _json(past: "BridgeHistory") -> str:
         },
     }
     return json.dumps(fields, indent=1) + "\n"
-
-
-def _day(time_s: float) -> str:
-    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"
 
 
 HISTORY: Final = Subcommand(

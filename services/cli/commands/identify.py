@@ -1,85 +1,10 @@
 """The command `driveby identify`."""
 
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 from services.cli.parser import Subcommand
-from services.cli.parsing import CERTIFICATES, a_console
-from services.common.kinds import ARRAYS, NETCDF, RERUN, RESULTS
-from services.common.options import (
-    baseline_option,
-    fuse_suspect_option,
-    method_option,
-    opt,
-    output_folder_option,
-    output_option,
-    positional,
-    seed_option,
-    site_option,
-    source,
-    validations_option,
-    whole,
-)
-
-_MANY: Final = "many crossings"
-
-
-@dataclass(frozen=True, kw_only=True)
-class IdentifyOptions:
-    """Recordings, how their crossings are identified, and what is written."""
-
-    recordings: tuple[Path | str, ...] = positional(
-        "recordings, also as s3://…; with --into also folders of them",
-        source,
-        nargs="+",
-        metavar="REC.mcap",
-    )
-    site: Path | None = site_option("site file (default: the site stored in the recording)")
-    method: str = method_option()
-    json: Path | None = output_option("JSON file of the results", "OUT.json", RESULTS)
-    rrd: Path | None = output_option("Rerun file of the results", "OUT.rrd", RERUN)
-    draws: Path | None = output_option(
-        "file of the posterior draws of method pre, for ArviZ", "OUT.npz|OUT.nc", ARRAYS, NETCDF
-    )
-    figures: Path | None = output_folder_option(
-        "folder for figures of every crossing and bridge, as PNG and SVG"
-    )
-    baseline: Path | None = baseline_option()
-    fuse_suspect: bool = fuse_suspect_option()
-    validations: Path | None = validations_option(
-        f"folder of the certificates that results refer to (default: {CERTIFICATES})"
-    )
-    seed: int = seed_option()
-    into: Path | None = output_folder_option(
-        "store each result here as it is computed; run again to resume. Unreadable input is "
-        "listed and skipped (exit code 3)",
-        group=_MANY,
-    )
-    scheduler: str | None = opt(
-        "number of processes on this machine (default N: one for each processor), or "
-        "address of a Dask cluster; the results are the same",
-        group=_MANY,
-        metavar="processes|processes:N|tcp://…|tls://…",
-    )
-    batch: int | None = opt(
-        "number of crossings in one task of a cluster (default: 50)",
-        whole("a number of crossings", 1, 200),
-        group=_MANY,
-        metavar="N",
-    )
-    reconnect_timeout: int | None = opt(
-        "seconds to wait for a lost scheduler or for workers (default: 300)",
-        whole("seconds", 1, 86_400),
-        group=_MANY,
-        metavar="S",
-    )
-    tls: Path | None = opt("credentials of a cluster's client", Path, group=_MANY, metavar="FOLDER")
-
-    @property
-    def search_method(self) -> str:
-        """Name of the method in settings and results."""
-        return self.method.replace("-", "_")
+from services.cli.parsing import a_console
+from services.cli.settings import IdentifyOptions
 
 
 def _identify(asked: IdentifyOptions) -> int:

@@ -25,8 +25,8 @@ from schemas.site_file import parse_site, site_hash, site_toml
 from schemas.topics import Message
 from schemas.validation_records import VehicleBridgePair, pair_hash
 from services.cli import main as cli
-from services.cli.commands.identify import IdentifyOptions
 from services.cli.identify import identify_command
+from services.cli.settings import IdentifyOptions
 from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.importing import import_command
