@@ -5,6 +5,7 @@ as a vendor's table. Guesses that change numbers must be confirmed.
 """
 
 import logging
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +14,7 @@ from schemas.site import Site
 from services.common.errors import InputError
 from services.common.progress import Steps, no_step_progress
 from services.drives.csv_import import read_folder, read_pair
-from services.drives.plausible import check_plausible
+from services.drives.plausible import check_plausible, notes_of
 from services.drives.runs import Run
 from services.drives.tables.findings import Target
 from services.drives.tables.mapping import ImportMap
@@ -22,7 +23,7 @@ from services.finding.placed import rates_hz
 
 _log = logging.getLogger(__name__)
 _MAX_SHOWN = 3
-_OTHER_FORM = (": line 1: ", "holds no accel_NN.csv", "is not UTF-8 text")
+_OTHER_FORM = re.compile(r": line [12]: |holds no accel_NN.csv|is not UTF-8 text")
 """Errors of the exact reader for files of another form."""
 
 
@@ -80,7 +81,7 @@ def understood_runs(
             if not all(path.exists() for path in sources):
                 raise
         else:
-            return Understood(runs, [], ImportMap())
+            return Understood(runs, notes_of(runs, site), ImportMap())
     declared = next(iter(rates_hz(site.sensor, vehicle).values()))
     target = Target(site, vehicle, declared, how.zone, how.start)
     try:
@@ -89,7 +90,7 @@ def understood_runs(
             check_plausible(run, site, None)
     except InputError as error:
         raise _better(exact, error) from error
-    return found
+    return found._replace(guesses=[*found.guesses, *notes_of(found.runs, site)])
 
 
 def exact_runs(
@@ -109,5 +110,5 @@ def _better(exact: InputError | None, general: InputError) -> InputError:
         return general
     if "no such file" in str(exact) or "holds no table" in str(general):
         return exact
-    is_other_form = any(words in str(exact) for words in _OTHER_FORM)
+    is_other_form = _OTHER_FORM.search(str(exact)) is not None
     return general if is_other_form or "--" in str(general) else exact

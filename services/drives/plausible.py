@@ -1,5 +1,7 @@
 """Cross-checks of a CSV drive: units and columns that contradict the numbers."""
 
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -10,12 +12,17 @@ from services.common.errors import InputError
 from services.common.geodesy import on_plane_m
 from services.drives.runs import Run
 from services.drives.tables import judged
+from services.drives.tables.clocks import clock_note
+from services.drives.tables.parts import Guess
+from services.drives.tables.stamps import LATEST_UNIX_S
+from services.drives.tables.units import SPEED
 from services.finding.placed import middle_sensor
 
 _DRIVING_M: Final = 20.0
 """Distance in m below which the speed column is not judged: fixes scatter by metres."""
-_SPEED_UNITS: Final = {"km/h": 3.6, "knots": 1.943844, "mph": 2.236936}
-_UNIT_TOLERANCE: Final = 0.04
+_SPEED_TOLERANCE: Final = 0.25
+_HIGHEST_M: Final = 9000.0
+"""Highest altitude of a road in m."""
 
 
 def check_plausible(run: Run, site: Site, vehicle: Vehicle | None = None) -> None:
@@ -23,7 +30,7 @@ def check_plausible(run: Run, site: Site, vehicle: Vehicle | None = None) -> Non
 
     Gravity, and noise against its declared density, are compared where `vehicle` is given.
     """
-    _check_exchanged(run, site)
+    _check_coordinates(run, site)
     _check_speed(run)
     means = [abs(float(values.mean())) for values in run.channels.values()]
     if len(means) > 1 and all(abs(mean - 1.0) < 0.03 for mean in means):
@@ -35,6 +42,14 @@ def check_plausible(run: Run, site: Site, vehicle: Vehicle | None = None) -> Non
         _check_gravity(run, site, vehicle)
         ratio = judged.noise_ratio(run.channels, run.rate_hz, site, vehicle)
         found = judged.unit_by_numbers(run.channels, ratio)
+        if found is None and judged.is_counted(run.channels):
+            raise judged.refuse_counts(run.source)
+        if found is None and judged.is_beyond(run.channels, ratio):
+            raise judged.refuse_unit(run.source, ratio)
+        if run.accel_time_s[0] > LATEST_UNIX_S:
+            raise InputError(f"{run.source}: time_s is after 2066: seconds since 1904?")
+        if any(judged.sentinels(values).any() for values in run.channels.values()):
+            raise InputError(f"{run.source}: 9999 or the like stands for no value")
         if found is not None and found.unit != "m/s2":
             raise InputError(f"{run.source}: accelerations are in {found.unit}: {found.why}")
 
@@ -56,17 +71,26 @@ def _check_gravity(run: Run, site: Site, vehicle: Vehicle) -> None:
             )
 
 
-def _check_exchanged(run: Run, site: Site) -> None:
+def _check_coordinates(run: Run, site: Site) -> None:
+    """Raise InputError where positions are near a bridge in another order, unit or sign only."""
     latitude, longitude = run.gnss.latitude_deg, run.gnss.longitude_deg
     near = judged.nearest_m(latitude, longitude, site.bridges)
     if near < judged.NEAR_M:
         return
-    swapped = judged.nearest_m(longitude, latitude, site.bridges)
-    if swapped < judged.NEAR_M:
-        raise InputError(
-            f"{run.source}: latitude_deg and longitude_deg of its positions are exchanged: "
-            f"{near / 1000:.0f} km from the site's bridges, {swapped / 1000:.1f} km the other way"
-        )
+    read = judged.coordinates(latitude, longitude, site, None)
+    if read.distance_m >= judged.NEAR_M:
+        return
+    if read.is_exchanged:
+        problem = "latitude_deg and longitude_deg of its positions are exchanged"
+    elif read.unit != "deg":
+        problem = f"its positions are in {read.unit}, not in degrees"
+    else:
+        name = "longitude_deg" if read.signs[1] < 0.0 else "latitude_deg"
+        problem = f"{name} of its positions has its sign turned"
+    raise InputError(
+        f"{run.source}: {problem}: {near / 1000:.0f} km from the site's bridges, "
+        f"{read.distance_m / 1000:.1f} km the other way"
+    )
 
 
 def _check_speed(run: Run) -> None:
@@ -78,9 +102,35 @@ def _check_speed(run: Run) -> None:
     if straight < max(_DRIVING_M, 0.9 * path):
         return
     ratio = float(np.abs(steps).sum()) / straight
-    for unit, factor in _SPEED_UNITS.items():
-        if abs(ratio / factor - 1.0) < _UNIT_TOLERANCE:
-            raise InputError(
-                f"{run.source}: speed_mps is {ratio:.2f} times the speed of the positions, which "
-                f"is {unit}: divide it by {factor:g}"
-            )
+    unit = judged.speed_unit(ratio)
+    if unit not in (None, "m/s"):
+        raise InputError(
+            f"{run.source}: speed_mps is {ratio:.2f} times the speed of the positions, which "
+            f"is {unit}: divide it by {1.0 / SPEED[str(unit)]:g}"
+        )
+    if abs(ratio - 1.0) > _SPEED_TOLERANCE:
+        raise InputError(f"{run.source}: speed_mps is {ratio:.2f} times the speed of the positions")
+
+
+def notes_of(runs: Sequence[Run], site: Site) -> list[Guess]:
+    """Return notes on what is strange in a drive and may be right."""
+    return [Guess(f"{Path(run.source).name}: {text}", "lost") for run in runs
+            for text in _strange(run, site)]  # fmt: skip
+
+
+def _strange(run: Run, site: Site) -> Iterator[str]:
+    near_m = judged.nearest_m(run.gnss.latitude_deg, run.gnss.longitude_deg, site.bridges)
+    if near_m > judged.NEAR_M:
+        yield f"no bridge of the site file is near: the nearest fix is {near_m / 1000:.0f} km away"
+    for name, values in run.channels.items():
+        if values.size > 1 and float(np.ptp(values)) == 0.0:
+            yield f"{name} never changes"
+    for end in ("front", "rear"):
+        body, axle = run.channels.get(f"sprung_{end}"), run.channels.get(f"unsprung_{end}")
+        if body is not None and axle is not None and np.std(body) > 2.0 * np.std(axle) > 0.0:
+            yield f"the {end} body shakes more than its axle: are the two columns exchanged?"
+    if np.nanmax(np.abs(run.gnss.altitude_m), initial=0.0) > _HIGHEST_M:
+        yield f"altitudes reach {np.nanmax(run.gnss.altitude_m):g} m: in another unit?"
+    note = clock_note(run.accel_time_s, run.gnss.time_s)
+    if note is not None:
+        yield note

@@ -47,7 +47,11 @@ def scaled(
         unit = judged.unit_by_numbers(rest, ratio)
         first = owner[next(iter(rest))]
         if unit is None:
-            if all(owner[name].placed[name].why != "exact" for name in rest):
+            if judged.is_counted(rest):
+                raise judged.refuse_counts(str(first.sheet.path))
+            if judged.is_beyond(rest, ratio) or all(
+                owner[name].placed[name].why != "exact" for name in rest
+            ):
                 raise judged.refuse_unit(str(first.sheet.path), ratio)
             unit = judged.UnitFound("m/s2", "as their names want it")
         for name in rest:

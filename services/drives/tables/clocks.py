@@ -17,6 +17,10 @@ Floats = NDArray[np.float64]
 
 _MAX_QUARTERS: Final = 4 * 14
 """Largest difference between UTC and a country's clocks, in quarters of an hour."""
+_LONG_S: Final = 3600.0
+"""First time beyond which a count from the start is not that of a drive."""
+_GPS_LESS_UTC_S: Final = 18.0
+_EPOCHS_S: Final = {"gps_s": 315_964_782.0, "labview_s": 2_082_844_800.0}
 
 
 def begins(
@@ -55,6 +59,7 @@ def begins(
 def _start(part: TablePart, run: str, runs: int, target: Target, found: Findings) -> float:
     """Return the start of a drive whose times count from it."""
     given_time = part.given.time.start
+    first_s = float(np.nanmin(part.times.time_s))
     if isinstance(given_time, dict):
         given_time = given_time.get(run)
     where = f"{part.sheet.path}: start"
@@ -64,15 +69,37 @@ def _start(part: TablePart, run: str, runs: int, target: Target, found: Findings
     if target.start is None or runs > 1:
         several = 'of each run in [file.time] of a map, start = { 01 = "…" } (--map)'
         how = several if runs > 1 else "with --start 2026-05-01T09:30:00+02:00"
+        if part.times.format == "clock" and first_s > _LONG_S:
+            raise InputError(
+                f"{part.sheet.path}: times of day have no date: give the midnight before them "
+                "with --start 2026-05-01T00:00:00+02:00"
+            )
+        ahead = "" if first_s < _LONG_S else f" (its first row is {first_s:.0f} s after it)"
+        noted = "" if part.sheet.start_text is None else f'; the file has "{part.sheet.start_text}"'
         raise InputError(
-            f"{part.sheet.path}: times count from the start of the drive, give that {how}"
+            f"{part.sheet.path}: times count from the start of the drive, give that {how}{ahead}"
+            f"{noted}"
         )
     start_s = start_of(target.start, zone, "--start")
+    if part.times.format == "clock" and first_s > _LONG_S and not _is_midnight(target.start):
+        raise InputError(
+            f"--start: is {target.start}, it must be the midnight before the times of day of "
+            f"{part.name}, as 2026-05-01T00:00:00+02:00"
+        )
+    if part.times.format != "clock" and first_s > _LONG_S:
+        found.guess(part, f"times begin {first_s:.0f} s after --start")
     text = target.start
     if zone is not None and not re.search(r"(Z|[+-]\d\d:?\d\d)$|^[\d.]+$", text):
         text = str(start_s)
     found.time(part, start=text)
     return start_s
+
+
+def _is_midnight(text: str) -> bool:
+    return (
+        re.fullmatch(r"\d{4}-\d\d-\d\d([T ]00:00(:00(\.0+)?)?(Z|[+-]\d\d:?\d\d)?)?", text)
+        is not None
+    )
 
 
 def _overlap(one: TablePart, other: TablePart) -> bool:
@@ -89,13 +116,37 @@ def check_overlap(
         return
     apart_s = float(other_s[0] - time_s[0])
     quarters = round(apart_s / 900.0)
+    for form, between_s in _EPOCHS_S.items():
+        if abs(abs(apart_s) - between_s) < 1000.0:
+            raise InputError(
+                f"{part.sheet.path}: begins {apart_s:+.0f} s from {Path(source).name}, the clocks "
+                f'must agree: format = "{form}" in [file.time] of the other one in a map (--map)?'
+            )
     name = Path(source).name
     if not 0 < abs(quarters) <= _MAX_QUARTERS or abs(apart_s - 900.0 * quarters) > 60.0:
         raise InputError(
-            f"{part.sheet.path}: begins {apart_s:+.3f} s from {name}, the clocks of both must agree"
+            f"{part.sheet.path}: begins {apart_s:+.3f} s from {name}, the clocks of both must "
+            f"agree{_leap_hint(apart_s)}; offset_s in [file.time] of a map (--map) corrects one"
         )
     raise InputError(
         f"{part.sheet.path}: begins {apart_s:+.3f} s from {name}, {abs(quarters) / 4:g} h: another "
         f"time zone: the clocks must agree; set offset_s = {-900.0 * quarters:.0f} in its "
         "[file.time] of a map (--map), or zone"
+    )
+
+
+def _leap_hint(apart_s: float) -> str:
+    is_leap = abs(abs(apart_s) - _GPS_LESS_UTC_S) < 1.0
+    return f" ({_GPS_LESS_UTC_S:.0f} s is GPS time less UTC)" if is_leap else ""
+
+
+def clock_note(time_s: Floats, other_s: Floats) -> str | None:
+    """Return a note where positions begin and end late by the same time, as other clocks do."""
+    first_s, last_s = float(other_s[0] - time_s[0]), float(other_s[-1] - time_s[-1])
+    if min(abs(first_s), abs(last_s)) < 1.0 or abs(first_s - last_s) > 0.5:
+        return None
+    return (
+        f"positions begin and end {abs(first_s):.1f} s {'after' if first_s > 0 else 'before'} the "
+        f"accelerations: do the clocks agree{_leap_hint(first_s)}? offset_s in [file.time] of a "
+        "map (--map) corrects one"
     )

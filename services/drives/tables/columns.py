@@ -20,18 +20,29 @@ WEEK: Final = "week"
 _EXACT: Final = {name: name for name in (TIME, *POSITION_COLUMNS)}
 _WORDS: Final = {
     TIME: "time timestamp t zeit zeitstempel utc uhrzeit epoch datetime datumzeit unixtime tow "
-    "itow sow sample index samples",
-    DATE: "date datum",
-    WEEK: "week gpsweek wn woche gpswoche",
-    "latitude_deg": "latitude lat breite breitengrad",
-    "longitude_deg": "longitude lon long lng laenge laengengrad länge längengrad",
-    "altitude_m": "altitude alt height elevation ele hoehe höhe h msl",
-    "speed_mps": "speed velocity geschwindigkeit sog v vel groundspeed tempo speedoverground",
+    "itow sow gpstime gpssow gpstow temps horodatage heure horodate tiempo hora orario tijd",
+    DATE: "date datum fecha",
+    WEEK: "week gpsweek wn woche gpswoche semaine",
+    "latitude_deg": "latitude lat breite breitengrad latitud latitudine",
+    "longitude_deg": "longitude lon long lng laenge laengengrad länge längengrad longitud "
+    "longitudine",
+    "altitude_m": "altitude alt height elevation ele hoehe höhe h msl hmsl altitud quota hauteur",
+    "speed_mps": "speed velocity geschwindigkeit geschw sog v vel groundspeed gspeed tempo "
+    "speedoverground vitesse velocidad velocità velocita snelheid kmh mph kph",
 }
-_BODY: Final = {"body", "sprung", "aufbau", "frame", "chassis", "rahmen", "cabin", "oben", "upper"}
-_AXLE: Final = {"axle", "unsprung", "wheel", "achse", "rad", "hub", "radtraeger", "unten", "lower"}
-_FRONT: Final = {"front", "vorn", "vorne", "va", "f", "v", "fr", "vorderachse"}
-_REAR: Final = {"rear", "back", "hinten", "hinter", "ha", "r", "h", "re", "hinterachse"}
+_COUNTERS: Final = {"sample", "samples", "index", "scan", "scans", "n", "nr", "no", "row", "zeile"}
+"""Names of counters, which are times only where no column has times."""
+_BODY: Final = {"body", "sprung", "aufbau", "frame", "chassis", "rahmen", "cabin", "oben", "upper",
+                "caisse", "carrosserie", "cassa", "carrozzeria", "carrocería"}  # fmt: skip
+_AXLE: Final = {"axle", "unsprung", "wheel", "achse", "rad", "hub", "radtraeger", "unten", "lower",
+                "essieu", "roue", "assale", "ruota", "eje", "rueda", "radträger"}  # fmt: skip
+_FRONT: Final = {"front", "vorn", "vorne", "va", "f", "v", "fr", "fl", "vl", "vr", "vorderachse",
+                 "avant", "av", "anteriore", "delantero", "delantera"}  # fmt: skip
+_REAR: Final = {"rear", "back", "hinten", "hinter", "ha", "r", "h", "re", "rl", "rr", "hl", "hr",
+                "hinterachse", "arriere", "arrière", "ar", "posteriore", "trasero", "trasera",
+                }  # fmt: skip
+_VERTICAL: Final = {"z", "az", "vertical", "vertikal", "vert", "verticale", "up", "senkrecht"}
+_LEVEL: Final = {"x", "y", "ax", "ay", "lateral", "longitudinal", "quer", "längs", "laengs"}
 _FILLERS: Final = frozenset(
     [
         "gps",
@@ -76,23 +87,60 @@ def placed_columns(
     and the accelerations, or a time, latitude, longitude, and further altitude and speed.
     """
     found = _given(sheet, given, channels)
-    assigned = {one.column for one in found.values()}
-    for column, head in enumerate(sheet.header):
-        if column in assigned:
-            continue
-        name, unit = unit_in(head)
-        if column < len(sheet.units) and sheet.units[column]:
-            unit = sheet.units[column]
-        quantity, why = _quantity(head, name, channels)
-        if quantity is None or quantity in found:
-            continue
-        found[quantity] = Placed(column, unit, why)
-        assigned.add(column)
+    taken = {one.column for one in found.values()}
+    candidates = _candidates(sheet, channels, taken)
+    for quantity, several in candidates.items():
+        if quantity not in found:
+            found[quantity] = _only(sheet, quantity, several, channels)
+    if TIME not in found and DATE not in found:
+        found |= _counter(sheet, found)
     if not set(found) - {TIME, DATE, WEEK}:
         found |= _by_order(sheet, found, channels)
     used = {one.column for one in found.values()}
     unused = [head for column, head in enumerate(sheet.header) if column not in used]
     return found, unused
+
+
+def _candidates(sheet: Sheet, channels: Sequence[str], taken: set[int]) -> dict[str, list[Placed]]:
+    """Return the columns that a quantity may be by their names, those with exact names alone."""
+    found: dict[str, list[Placed]] = {}
+    for column, head in enumerate(sheet.header):
+        if column in taken or not sheet.has_cells(column):
+            continue
+        name, unit = unit_in(head)
+        if column < len(sheet.units) and sheet.units[column]:
+            unit = sheet.units[column]
+        quantity, why = _quantity(head, name, channels)
+        if quantity is not None:
+            found.setdefault(quantity, []).append(Placed(column, unit, why))
+    for quantity, several in found.items():
+        exact = [one for one in several if one.why == "exact"]
+        found[quantity] = exact or several
+    return found
+
+
+def _only(sheet: Sheet, quantity: str, several: list[Placed], channels: Sequence[str]) -> Placed:
+    """Return the one column that a quantity is; InputError where several accelerations may be."""
+    if len(several) > 1 and quantity in channels:
+        upward = [one for one in several if set(_words(sheet.header[one.column])) & _VERTICAL]
+        if len(upward) != 1:
+            names = ", ".join(sheet.column_name(one.column) for one in several[:4])
+            raise InputError(
+                f"{sheet.path}: {quantity} may be {names}: choose one in [file.columns] of a map "
+                "(--map)"
+            )
+        several = upward
+    return several[0]
+
+
+def _counter(sheet: Sheet, found: dict[str, Placed]) -> dict[str, Placed]:
+    """Return a column that counts samples, or whose name begins with a word for time."""
+    used = {one.column for one in found.values()}
+    heads = [(n, _words(unit_in(h)[0])) for n, h in enumerate(sheet.header) if n not in used]
+    times = [n for n, words in heads if words and words[0] in _WORDS[TIME].split()]
+    counters = [n for n, words in heads if words and "".join(words) in _COUNTERS]
+    chosen = (times + counters)[:1]
+    return {TIME: Placed(chosen[0], _head_unit(sheet, chosen[0]), "name")} if chosen else {}
 
 
 def column_number(sheet: Sheet, column: ColumnName, key: str) -> int:
@@ -154,6 +202,8 @@ def _quantity(head: str, name: str, channels: Sequence[str]) -> tuple[str | None
         if plain == "".join(_words(channel)):
             return channel, "name"
     words_used = [word for word in words if word not in _FILLERS] or words
+    if not words_used:
+        return None, ""
     for quantity, known in _WORDS.items():
         if "".join(words_used) in known.split() or (
             len(words_used) == 1 and words_used[0] in known.split()
@@ -166,7 +216,7 @@ def _quantity(head: str, name: str, channels: Sequence[str]) -> tuple[str | None
             (("front", _FRONT), ("rear", _REAR)),
         )
     ]
-    if all(len(side) == 1 for side in sides):
+    if all(len(side) == 1 for side in sides) and not set(words) & _LEVEL:
         channel = f"{sides[0][0]}_{sides[1][0]}"
         if channel in channels:
             return channel, "name"
@@ -202,7 +252,12 @@ def _is_smooth(values: NDArray[np.float64]) -> bool:
     return known.size > 1 and bool(np.ptp(known) < 0.02 * np.abs(known).max())
 
 
+def words_of(sheet: Sheet, column: int) -> set[str]:
+    """Return the words in the name of a column, counted from 0."""
+    return set(_words(sheet.header[column])) if column < len(sheet.header) else set()
+
+
 def _words(name: str) -> list[str]:
     plain = unicodedata.normalize("NFC", name).lower()
     plain = re.sub(r"(?<=[a-zäöüß])(?=[0-9])|(?<=[0-9])(?=[a-zäöüß])", " ", plain)
-    return [word for word in re.split(r"[^a-z0-9äöüß]+", plain) if word]
+    return [word for word in re.split(r"[\W_]+", plain) if word]

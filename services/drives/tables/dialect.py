@@ -27,8 +27,34 @@ _LONGEST_HEAD: Final = 200
 """Maximum number of lines before the first row, for a logger's own description."""
 _UNIT_SEPARATOR: Final = "\x1f"
 """Separator between the cells of a file with quotation marks, once these are removed."""
-_NUMBER: Final = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?nan|[+-]?inf", re.I)
-_TIME: Final = re.compile(r"\d{1,4}[-./]\d{1,2}[-./]\d{1,4}.*|\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?.*")
+_NUMBER: Final = re.compile(
+    r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][+-]?\d+)?|[+-]?nan|[+-]?inf"
+    r"|[+-]?\d{1,3}((\.\d{3})+(,\d+)?|(,\d{3})+(\.\d+)?)", re.I
+)  # fmt: skip
+_THOUSANDS: Final = {
+    ",": re.compile(r"[+-]?\d{1,3}(\.\d{3})+(,\d+)?"),
+    ".": re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d+)?"),
+}
+"""Numbers with separators between thousands, by the decimal sign."""
+_ABSENT: Final = frozenset((
+    "", "nan", "na", "n/a", "#n/a", "#na", "#nv", "null", "none", "-", "--", "---", "*", "**", "?",
+    "over", "overload", "ovl", "ovr", "ol", "ovf", "err", "error", "invalid", "missing",
+))  # fmt: skip
+"""Cells without a value."""
+_COMMENT: Final = ("#", "%", "//", "!", "*")
+_KINDS: Final = (
+    (b"PK\x03\x04", "a spreadsheet or archive, save it as CSV"),
+    (b"\xd0\xcf\x11\xe0", "an old spreadsheet, save it as CSV"),
+    (b"\x1f\x8b", "compressed, unpack it"),
+    (b"$G", "a log of NMEA sentences, convert it to a table of fixes"),
+)
+_LONGEST_FOOT: Final = 20
+"""Largest number of lines of text after the last row."""
+_TIME: Final = re.compile(
+    r"\d{1,4}[-./ ]\w{1,4}\.?[-./ ]\d{1,4}\b.*|\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?.*|\d{8}T\d{6}.*"
+    r"|[NSEW] ?\d[\d. ]*|\d[\d. ]* ?[NSEW]|[NSEW]|[NSEW]? ?\d+ ?°.*"
+)
+"""Times, and angles that are no plain numbers."""
 _COMMA: Final = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 
@@ -58,6 +84,14 @@ class Sheet(NamedTuple):
     """Line of each row in the file."""
     separator: str
     width: int
+    start_text: str | None = None
+    """Line before the header that seems to hold the start of the drive."""
+    left_out: int = 0
+    """Lines of comments, an end of text and a last row that was cut off."""
+
+    def has_cells(self, column: int) -> bool:
+        """Return whether a column, counted from 0, has any value."""
+        return any(line.split(self.separator, column + 1)[column].strip() for line in self.lines)
 
     def texts(self, column: int) -> list[str]:
         """Return the cells of a column, counted from 0."""
@@ -67,6 +101,8 @@ class Sheet(NamedTuple):
         """Return the numbers of a column (n,); an empty cell is NaN."""
         lines = self.lines
         if self.dialect.decimal == ",":
+            if any("." in text for text in self.texts(column)):
+                return self._grouped(column)
             lines = [line.replace(",", ".") for line in lines]
         try:
             found = np.loadtxt(
@@ -81,14 +117,40 @@ class Sheet(NamedTuple):
             )
         return found
 
+    def _grouped(self, column: int) -> Floats:
+        """Return a column with points in a file of decimal commas; InputError if ambiguous.
+
+        Points separate thousands where a cell has both signs; without a comma they are decimal
+        points, unless three digits follow each.
+        """
+        cells = [cell for cell in self.texts(column) if cell.lower() not in _ABSENT]
+        thousands = _THOUSANDS[","]
+        if not any("," in cell for cell in cells):
+            pointed = [cell for cell in cells if "." in cell]
+            if all(thousands.fullmatch(cell) for cell in pointed):
+                raise InputError(
+                    f"{self.path}: {self.column_name(column)}, such as {pointed[0]}: points "
+                    'between thousands, or decimal points? give decimal = "." in a map (--map)'
+                )
+            read = [cell.replace(",", ".") for cell in self.texts(column)]
+            plain = self._replace(lines=read, separator="\x1e", dialect=self.dialect._replace(
+                decimal="."), header=(self.column_name(column),))  # fmt: skip
+            return np.array([plain._value(row, 0) for row in range(len(read))])
+        return np.array([self._value(row, column) for row in range(len(self.lines))])
+
     def _value(self, row: int, column: int) -> float:
         cell = self.lines[row].split(self.separator)[column].strip()
-        if cell == "" or cell.lower() in ("nan", "na", "n/a", "null", "-", "--"):
+        if cell.lower() in _ABSENT:
             return np.nan
+        sign = self.dialect.decimal
+        number = cell
+        if _THOUSANDS[sign].fullmatch(cell):
+            number = cell.replace("." if sign == "," else ",", "")
         try:
             if "_" in cell:
                 raise ValueError(cell)
-            return float(cell.replace(self.dialect.decimal, "."))
+            number = number.replace(sign, ".")
+            return float(re.sub(r"[dD](?=[+-]?\d+$)", "e", number))
         except ValueError as error:
             sign = "a decimal comma" if self.dialect.decimal == "," else "a decimal point"
             raise InputError(
@@ -107,7 +169,7 @@ def read_sheet(path: Path, given: FileMap) -> Sheet:
     """Read the text of a table; InputError if it is none."""
     encoding, text = _decoded(path, given.encoding)
     lines = text.splitlines()
-    used = [line for line in lines if line.strip()]
+    used = [line for line in lines if line.strip() and not line.startswith(_COMMENT)]
     if not used:
         raise InputError(f"{path}: is empty, a table of samples or fixes expected")
     delimiter = given.delimiter or _delimiter(path, used)
@@ -116,6 +178,8 @@ def read_sheet(path: Path, given: FileMap) -> Sheet:
         lines, separator = [_UNIT_SEPARATOR.join(row) for row in cells], _UNIT_SEPARATOR
     else:
         separator = delimiter
+    if separator == delimiter:
+        lines = _without_ends(lines, delimiter)
     if delimiter == " ":
         lines, separator = [_UNIT_SEPARATOR.join(line.split()) for line in lines], _UNIT_SEPARATOR
     split = [line.split(separator) for line in lines[: _LONGEST_HEAD + _SAMPLE]]
@@ -123,14 +187,27 @@ def read_sheet(path: Path, given: FileMap) -> Sheet:
     first = given.first_line or _first_row(path, split)
     width = len(split[first - 1]) if first <= len(split) else 0
     header_line, units_line = _heads(split, first, width, given)
+    if separator == "," and header_line == 0:
+        _check_commas(path, split, first, width)
     rows = [(n, line) for n, line in enumerate(lines[first - 1 :], start=first) if line.strip()]
+    rows, left_out = _without_text(rows, separator, width)
     _check_widths(path, rows, separator, width)
     dialect = Dialect(encoding, delimiter, decimal, header_line, units_line, first)
     head = tuple(c.strip() for c in split[header_line - 1]) if header_line else ()
     units = tuple(c.strip() for c in split[units_line - 1]) if units_line else ()
     return Sheet(
-        path, dialect, head, units, [r for _, r in rows], [n for n, _ in rows], separator, width
-    )
+        path, dialect, head, units, [r for _, r in rows], [n for n, _ in rows], separator, width,
+        _start_text(lines[: max(header_line, first) - 1], separator), left_out,
+    )  # fmt: skip
+
+
+def _start_text(lines: list[str], separator: str) -> str | None:
+    """Return the line before a header that names a start and has a time."""
+    for line in lines:
+        plain = line.replace(separator, " ").strip().lstrip("#% ")
+        if re.search(r"start|begin|^t0|datum|date", plain, re.I) and re.search(r"\d+:\d\d", plain):
+            return plain[:60]
+    return None
 
 
 def described(dialect: Dialect) -> str:
@@ -149,6 +226,15 @@ def is_number(cell: str) -> bool:
 
 def _decoded(path: Path, encoding: str | None) -> tuple[str, str]:
     content = read_bytes(path)
+    for start, kind in _KINDS:
+        if content.startswith(start):
+            raise InputError(f"{path}: is {kind}")
+    is_marked = content.startswith((b"\xff\xfe", b"\xfe\xff"))
+    if encoding in (None, "utf-16") and not is_marked:
+        # Without its mark, every other byte of Latin text in UTF-16 is zero.
+        zeros = [content[k:2000:2].count(0) for k in range(2)]
+        if max(zeros) > 0.4 * min(len(content), 2000) / 2:
+            content = (b"\xff\xfe" if zeros[1] > zeros[0] else b"\xfe\xff") + content
     if encoding is None:
         if content.startswith((b"\xff\xfe", b"\xfe\xff")):
             encoding = "utf-16"
@@ -167,7 +253,7 @@ def _decoded(path: Path, encoding: str | None) -> tuple[str, str]:
 
 def _is_value(cell: str) -> bool:
     cell = cell.strip().strip('"')
-    return cell == "" or is_number(cell) or _TIME.fullmatch(cell) is not None
+    return cell.lower() in _ABSENT or is_number(cell) or _TIME.fullmatch(cell) is not None
 
 
 def _delimiter(path: Path, lines: list[str]) -> str:
@@ -227,6 +313,45 @@ def _heads(rows: list[list[str]], first: int, width: int, given: FileMap) -> tup
     if units is None:
         units = first - 1 if header and first - 1 > header and first - 1 in lines else 0
     return header, units
+
+
+def _without_ends(lines: list[str], delimiter: str) -> list[str]:
+    """Return lines without a delimiter after their last cell, where every row has one."""
+    if delimiter == " " or not all(
+        line.rstrip(" ").endswith(delimiter) for line in lines[-_SAMPLE:] if line.strip()
+    ):
+        return lines
+    if all(line.rstrip(" ").endswith(2 * delimiter) for line in lines[-_SAMPLE:] if line.strip()):
+        return lines  # an empty column, not an end
+    return [line.rstrip(" ").removesuffix(delimiter) for line in lines]
+
+
+def _without_text(
+    rows: list[tuple[int, str]], separator: str, width: int
+) -> tuple[list[tuple[int, str]], int]:
+    """Return rows without comments, text after the last row and a cut-off last row, and a count."""
+    found = [row for row in rows if not row[1].startswith(_COMMENT)]
+    for _ in range(_LONGEST_FOOT):
+        if len(found) < 3 or any(_has_value(cell) for cell in found[-1][1].split(separator)):
+            break
+        found.pop()
+    if len(found) > 2 and found[-1][1].count(separator) + 1 < width:
+        found.pop()
+    return found, len(rows) - len(found)
+
+
+def _has_value(cell: str) -> bool:
+    return is_number(cell) or _TIME.fullmatch(cell.strip()) is not None
+
+
+def _check_commas(path: Path, split: list[list[str]], first: int, width: int) -> None:
+    """Raise InputError if commas seem to be both decimal signs and delimiters."""
+    head = split[first - 2] if first > 1 else []
+    if width / 2 <= len(head) < width and not any(_has_value(cell) for cell in head if cell):
+        raise InputError(
+            f"{path}: its header has {len(head)} names and its rows {width} cells: decimal commas "
+            "between commas cannot be distinguished, export it with semicolons or decimal points"
+        )
 
 
 def _check_widths(path: Path, rows: list[tuple[int, str]], separator: str, width: int) -> None:

@@ -32,6 +32,16 @@ _IN_MG: Final = (60.0, 160.0)
 
 The least of all channels counts, as wheels drown the noise of theirs.
 """
+_GRAVITIES: Final = (
+    ("g", 1.0), ("m/s2", G), ("ft/s2", G / 0.3048), ("cm/s2", 100.0 * G), ("mg", 1000.0),
+    ("mm/s2", 1000.0 * G),
+)  # fmt: skip
+_LIVELY_M_PER_S2: Final = 3.0
+_WILD_M_PER_S2: Final = 30.0
+"""Standard deviations of a truck's quietest sensor that are unlikely, and impossible."""
+_SENTINELS: Final = (999.0, 999.9, 9999.0, 9999.9, 99999.0, 32767.0, 32768.0, 99.99, 9999.99)
+"""Numbers that loggers write where they have none, of either sign."""
+_MAX_ABSENT, _FAR_BEYOND = 0.2, 5.0
 _DRIVING_M: Final = 20.0
 _UNIT_TOLERANCE: Final = 0.04
 
@@ -67,7 +77,7 @@ def unit_by_numbers(channels: Mapping[str, Floats], ratio: float | None) -> Unit
     """Return the unit of channels as in the file; None without evidence."""
     means = [abs(float(np.mean(values))) for values in channels.values()]
     shown = f"{np.mean(means):.4g}"
-    for unit, size in (("g", 1.0), ("m/s2", G), ("cm/s2", 100.0 * G), ("mg", 1000.0)):
+    for unit, size in _GRAVITIES:
         within = 0.009 if size > 100.0 else _GRAVITY_TOLERANCE
         if all(abs(mean / size - 1.0) < within for mean in means):
             return UnitFound(unit, f"their mean is about {shown}, which is gravity in {unit}")
@@ -80,15 +90,52 @@ def unit_by_numbers(channels: Mapping[str, Floats], ratio: float | None) -> Unit
     return None
 
 
+def is_beyond(channels: Mapping[str, Floats], ratio: float | None) -> bool:
+    """Return whether channels in m/s² would shake as no truck does, so that the unit is another."""
+    quietest = min(float(np.std(values)) for values in channels.values())
+    return quietest > _WILD_M_PER_S2 or (
+        ratio is not None and ratio >= _IN_MG[0] and quietest > _LIVELY_M_PER_S2
+    )
+
+
+def is_counted(channels: Mapping[str, Floats]) -> bool:
+    """Return whether all numbers are whole and of some size, as a converter's counts are."""
+    return all(
+        bool(np.all(values == np.rint(values))) and float(np.std(values)) > 1.0
+        for values in channels.values()
+    )
+
+
+def sentinels(values: Floats) -> NDArray[np.bool_]:
+    """Return which values (n,) stand for none: 9999 and the like, far beyond all others."""
+    size = np.abs(values)
+    known = np.isfinite(size)
+    is_one = known & np.isin(size, _SENTINELS)
+    rest = size[known & ~is_one]
+    if not is_one.any() or not rest.size or is_one.mean() > _MAX_ABSENT:
+        return np.zeros(values.size, dtype=bool)
+    return is_one & (size > _FAR_BEYOND * max(float(rest.max()), 1e-9))
+
+
 def refuse_unit(where: str, ratio: float | None) -> InputError:
     """Return the error that requests the unit of accelerations."""
     seen = ""
     if ratio is not None:
         seen = f" (their noise is {ratio:.3g} of the declared one"
-        seen += ": mg or cm/s2?)" if _IN_MG[0] <= ratio <= _IN_MG[1] else ")"
+        in_mm = 6.0 * _IN_MG[0] <= ratio <= 10.0 * _IN_MG[1]
+        is_in_mg = _IN_MG[0] <= ratio <= _IN_MG[1]
+        seen += ": mg or cm/s2?)" if is_in_mg else ": mm/s2?)" if in_mm else ")"
     return InputError(
         f"{where}: the unit of the accelerations is undetermined{seen}, give it in a map (--map): "
         f"unit = one of {', '.join(ACCELERATION)}"
+    )
+
+
+def refuse_counts(where: str) -> InputError:
+    """Return the error that requests the factor of a converter's counts."""
+    return InputError(
+        f"{where}: accelerations are whole numbers, as counts of a converter are: give factor, the "
+        "calibrated factor to the unit, and unit of each in [file.columns] of a map (--map)"
     )
 
 
@@ -157,7 +204,7 @@ def speeds_of_positions(latitude: Floats, longitude: Floats, time_s: Floats) -> 
     return speed
 
 
-Angle = Literal["deg", "1e-7 deg", "ddmm"]
+Angle = Literal["deg", "1e-7 deg", "ddmm", "rad"]
 
 
 class ReadAs(NamedTuple):
@@ -165,6 +212,8 @@ class ReadAs(NamedTuple):
 
     unit: Angle
     is_exchanged: bool
+    signs: tuple[float, float]
+    """Factors of latitude and longitude, -1 where the sign is turned."""
     distance_m: float
     """Distance to the nearest bridge in this interpretation."""
 
@@ -173,17 +222,26 @@ def degrees(values: Floats, unit: str) -> Floats:
     """Return angles in degrees."""
     if unit == "1e-7 deg":
         return values * 1e-7
+    if unit == "rad":
+        return np.asarray(np.degrees(values))
     if unit == "ddmm":
         whole = np.trunc(values / 100.0)
         return np.asarray(whole + (values - 100.0 * whole) / 60.0)
     return values
 
 
-def coordinates(first: Floats, second: Floats, site: Site, unit: Angle | None) -> ReadAs:
-    """Return the unit and order by which positions are near a bridge; otherwise as they are."""
-    units: tuple[Angle, ...] = ("deg", "1e-7 deg", "ddmm") if unit is None else (unit,)
+def coordinates(
+    first: Floats, second: Floats, site: Site, unit: Angle | None, *, has_signs: bool = False
+) -> ReadAs:
+    """Return the unit, order and signs by which positions are near a bridge, or as they are.
+
+    Signs stay as they are where `has_signs`.
+    """
+    units: tuple[Angle, ...] = ("deg", "1e-7 deg", "ddmm", "rad") if unit is None else (unit,)
+    turned = ((1.0, 1.0),) if has_signs else ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
     found = [
-        ReadAs(one, swapped, nearest_m(*pair, site.bridges))
+        ReadAs(one, swapped, signs, nearest_m(signs[0] * pair[0], signs[1] * pair[1], site.bridges))
+        for signs in turned
         for swapped in (False, True)
         for one in units
         for pair in [_ordered(degrees(first, one), degrees(second, one), exchange=swapped)]

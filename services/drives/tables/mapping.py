@@ -12,12 +12,13 @@ from pydantic import BaseModel, ConfigDict, Field, Strict, StrictBool, Validatio
 from schemas.toml_text import parse_toml, read_toml_text
 from services.common.errors import InputError
 
-AccelerationUnit = Literal["m/s2", "g", "mg", "cm/s2"]
-SpeedUnit = Literal["m/s", "km/h", "knots", "mph"]
-AngleUnit = Literal["deg", "1e-7 deg", "ddmm"]
-LengthUnit = Literal["m", "ft"]
+AccelerationUnit = Literal["m/s2", "g", "mg", "ug", "cm/s2", "mm/s2", "ft/s2"]
+SpeedUnit = Literal["m/s", "km/h", "knots", "mph", "ft/s", "cm/s", "mm/s"]
+AngleUnit = Literal["deg", "1e-7 deg", "ddmm", "rad"]
+LengthUnit = Literal["m", "ft", "cm", "mm"]
 TimeFormat = Literal[
-    "unix_s", "unix_ms", "unix_us", "unix_ns", "excel_days", "date", "gps",
+    "unix_s", "unix_ms", "unix_us", "unix_ns", "excel_days", "matlab_days", "labview_s",
+    "date", "clock", "gps", "gps_s",
     "start_s", "start_ms", "start_us", "start_samples",
 ]  # fmt: skip
 Order = Literal["ymd", "dmy", "mdy"]
@@ -39,6 +40,10 @@ class ColumnMap(MapTable):
 
     column: ColumnName | None = None
     unit: AccelerationUnit | SpeedUnit | AngleUnit | LengthUnit | None = None
+    factor: Annotated[float, Field(ge=-1e12, le=1e12)] | None = None
+    """Factor from the file's number to its `unit`: of counts and volts, or -1 for another sign."""
+    side: ColumnName | None = None
+    """Column of N, S, E or W beside a latitude or longitude."""
     gravity_included: StrictBool | None = None
     """Whether an accelerometer at rest reads +g where its axis points up."""
     up: Literal[1, -1] | None = None
@@ -53,6 +58,8 @@ class TimeMap(MapTable):
     """Column of the date, where date and time of day are separate."""
     week_column: ColumnName | None = None
     """Column of the GPS week, where `column` has the seconds of the week."""
+    week: Annotated[int, Strict(), Field(ge=1043, le=9999)] | None = None
+    """GPS week of all rows, where no column has it."""
     format: TimeFormat | None = None
     order: Order | None = None
     """Order of the parts of a date."""

@@ -27,11 +27,13 @@ def track(
     first, second = fixes["latitude_deg"], fixes["longitude_deg"]
     declared_unit = part.given.columns.get("latitude_deg", ColumnMap())
     unit: Any = declared_unit.unit
-    read = judged.coordinates(first, second, target.site, unit)
+    given = [part.found.columns[name] for name in ("latitude_deg", "longitude_deg")]
+    has_signs = any(one.factor is not None or one.side is not None for one in given)
+    read = judged.coordinates(first, second, target.site, unit, has_signs=has_signs)
     if read.is_exchanged and declared_unit.column is not None:
-        read = judged.coordinates(first, second, target.site, unit or "deg")._replace(
-            is_exchanged=False
-        )
+        read = judged.coordinates(
+            first, second, target.site, unit or "deg", has_signs=has_signs
+        )._replace(is_exchanged=False)
     if read.unit != "deg" and unit is None:
         found.guess(part, f"coordinates are in {read.unit}: they are near a bridge then")
     latitude, longitude = judged.degrees(first, read.unit), judged.degrees(second, read.unit)
@@ -39,12 +41,12 @@ def track(
         latitude, longitude = longitude, latitude
         found.guess(part, "latitude and longitude are exchanged: they are near a bridge then")
         found.exchange(part, "latitude_deg", "longitude_deg")
-    for name in ("latitude_deg", "longitude_deg"):
+    latitude, longitude = read.signs[0] * latitude, read.signs[1] * longitude
+    for name, sign in zip(("latitude_deg", "longitude_deg"), read.signs, strict=True):
         found.column(part, name, unit=read.unit)
-    near_m = judged.nearest_m(latitude, longitude, target.site.bridges)
-    if near_m > judged.NEAR_M:
-        far = "" if not np.isfinite(near_m) else f" ({near_m / 1000.0:.0f} km)"
-        found.guess(part, f"no bridge of the site file is near{far}", "lost")
+        if sign < 0.0:
+            found.column(part, name, factor=-1.0)
+            found.guess(part, f"{name} has its sign turned: it is near a bridge then")
     _check_range(part, "latitude_deg", latitude, 90.0)
     _check_range(part, "longitude_deg", longitude, 180.0)
     speed = _speed(part, latitude, longitude, fixes, found)

@@ -8,12 +8,16 @@ from numpy.typing import NDArray
 
 from services.common.errors import InputError
 from services.drives.tables.findings import Findings, Target
+from services.drives.tables.judged import sentinels
 from services.drives.tables.mapping import POSITION_COLUMNS
 from services.drives.tables.parts import TablePart
 from services.drives.tables.stamps import kept_rows
 
 Floats = NDArray[np.float64]
 
+_NO_FIX: Final = (91.0, 181.0, 99.0, 999.0, 9999.0, 99999.0, 99.9999, 999.9999)
+"""Latitudes and longitudes that receivers write without a fix."""
+_MAX_OUT: Final = 0.5
 _HELD: Final = 0.5
 """Share of fixes equal to their predecessor where fixes are held between measurements."""
 
@@ -49,6 +53,11 @@ def _samples_of(
 ) -> tuple[Floats, dict[str, Floats]]:
     names = part.channels()
     values = np.column_stack([part.columns[name] for name in names])
+    absent = np.column_stack([sentinels(values[:, k]) for k in range(len(names))])
+    if absent.any():
+        shown = ", ".join(f"{value:g}" for value in np.unique(values[absent])[:3])
+        found.guess(part, f"{shown} stands for no value in {int(absent.sum())} cells", "lost")
+        values = np.where(absent, np.nan, values)
     whole = np.isfinite(values).all(axis=1) & np.isfinite(part.times.time_s)
     if not whole.any():
         raise InputError(f"{part.sheet.path}: no row has all of {', '.join(names)}")
@@ -75,6 +84,8 @@ def fixes(part: TablePart, begin_s: float, found: Findings) -> dict[str, Floats]
     """Return the fixes as in the file, by quantity, and `time_s`."""
     names = [name for name in POSITION_COLUMNS if name in part.columns]
     table = np.column_stack([part.times.time_s, *(part.columns[name] for name in names)])
+    is_out = np.isin(np.abs(table[:, 1:3]), _NO_FIX).any(axis=1)
+    table[is_out & (is_out.mean() < _MAX_OUT), 1:3] = np.nan
     there = np.isfinite(table[:, :3]).all(axis=1) & np.any(table[:, 1:3] != 0.0, axis=1)
     if "speed_mps" in names:
         there &= np.isfinite(table[:, 1 + names.index("speed_mps")])
@@ -92,7 +103,14 @@ def fixes(part: TablePart, begin_s: float, found: Findings) -> dict[str, Floats]
     if held:
         table = table[~is_held]
     found.file(part, held_fixes=bool(held))
-    kept = kept_rows(table[:, 0], table[:, 1:3], 0.0, even=False, where=str(part.sheet.path))
+    is_moving = np.concatenate([[True], np.any(np.diff(table[:, 1:3], axis=0) != 0, axis=1)])
+    rate_hz = _fixes_per_second(table[is_moving, 0])
+    even = part.given.time.even if not part.channels() and rate_hz else False
+    kept = kept_rows(table[:, 0], table[:, 1:3], rate_hz, even=even, where=str(part.sheet.path))
+    if kept.is_even:
+        found.time(part, even=True)
+        if even is None:
+            found.guess(part, f"stamps are rounded: fixes even at {rate_hz:g} Hz")
     if kept.repeated + kept.late:
         count = kept.repeated + kept.late
         found.guess(part, f"{count} fixes with a repeated or earlier time left out", "lost")
@@ -101,3 +119,12 @@ def fixes(part: TablePart, begin_s: float, found: Findings) -> dict[str, Floats]
         raise InputError(f"{part.sheet.path}: has 1 fix, at least 2 expected")
     columns = {name: table[:, 1 + k] for k, name in enumerate(names)}
     return columns | {"time_s": kept.time_s + begin_s}
+
+
+def _fixes_per_second(time_s: Floats) -> float:
+    """Return the rate of fixes whose stamps repeat, by their number in each; 0 if they do not."""
+    _, counts = np.unique(time_s, return_counts=True)
+    steps = np.diff(np.unique(time_s))
+    if counts.size < 3 or np.median(counts) < 2:
+        return 0.0
+    return float(np.median(counts) / np.median(steps))

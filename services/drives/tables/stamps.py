@@ -1,11 +1,10 @@
-"""Conversion of row times in any form to seconds since 1970 UTC; repeated, rounded stamps.
+"""Conversion of times that are numbers to seconds since 1970 UTC; repeated, rounded stamps.
 
 The size of a number shows its unit: seconds, milliseconds, … since 1970 are far apart, and small
 numbers count from the start of the drive.
 """
 
 import re
-from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from typing import Final, NamedTuple
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
@@ -31,11 +30,15 @@ _LEAPS: Final = (
     (1_435_708_800.0, 17), (1_483_228_800.0, 18),
 )  # fmt: skip
 """Times from which GPS less UTC has a value in s; none since 2017."""
+_LABVIEW_EPOCH_S: Final = 2_082_844_800.0
+"""Seconds from 1904, where LabVIEW and old spreadsheets begin, to 1970."""
+_MATLAB_EPOCH_DAYS: Final = 719_529.0
+"""Day 1970-01-01 in days of MATLAB's datenum."""
+LATEST_UNIX_S: Final = EARLIEST_S + _LABVIEW_EPOCH_S
+"""Year 2066: later seconds are taken to count from 1904."""
+_COARSE_S: Final = 0.09
+"""Resolution from which stamps were cut off rather than rounded, as whole seconds are."""
 _WEEK_S: Final = 604_800.0
-_DATE: Final = re.compile(
-    r"(\d{1,4})[-./](\d{1,2})[-./](\d{1,4})[T ,]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d+))?)?"
-    r"\s*(Z|UTC|GMT|[+-]\d{2}:?\d{2})?"
-)
 _OFFSET: Final = re.compile(r"([+-])(\d{1,2}):?(\d{2})?")
 _FEWEST_ROUNDED: Final = 0.3
 """Share of repeated stamps where they were rounded."""
@@ -75,6 +78,13 @@ def numeric_times(values: Floats, format: TimeFormat | None, step: "Steps") -> T
         whole = np.floor(values)  # days and their fraction separately: fewer digits are lost
         time_s = (whole - _EXCEL_EPOCH_DAYS) * 86_400.0 + np.round((values - whole) * 86_400.0, 6)
         return Times(time_s, format, is_relative=False, needs_zone=True)
+    if format == "matlab_days":
+        time_s = np.round((values - _MATLAB_EPOCH_DAYS) * 86_400.0, 5)
+        return Times(time_s, format, is_relative=False, needs_zone=True)
+    if format == "labview_s":
+        return Times(values - _LABVIEW_EPOCH_S, format, is_relative=False)
+    if format == "gps_s":
+        return Times(_utc_of_gps(values), format, is_relative=False)
     if format == "start_samples":
         return Times(values / step.declared_hz, format, is_relative=True)
     return Times(values * _START.get(format, 1.0), format, is_relative=True)
@@ -92,11 +102,15 @@ class Steps(NamedTuple):
 
 
 def _format_of(usual: float, step: Steps) -> TimeFormat:
+    if LATEST_UNIX_S < usual < LATEST_UNIX_S + 3.2e9:
+        return "labview_s"
     for name, scale in _UNIX.items():
         if EARLIEST_S <= usual * scale <= LATEST_S:
             return name
     if 36_526 <= usual <= 73_415 and step.median * 86_400.0 < 100.0 and step.median < 1e-3:
         return "excel_days"
+    if 730_486 <= usual <= 767_376 and step.median * 86_400.0 < 100.0 and step.median < 1e-3:
+        return "matlab_days"
     found = _by_rate(step)
     if found is not None and (step.declared_hz or step.unit is None):
         return found
@@ -124,7 +138,11 @@ def gps_times(weeks: Floats, seconds: Floats) -> Floats:
     """Return UTC of GPS weeks (n,) and the seconds in them (or milliseconds: beyond a week's)."""
     if np.nanmax(seconds) > _WEEK_S:
         seconds = seconds * 1e-3
-    since_gps = weeks * _WEEK_S + seconds
+    return _utc_of_gps(weeks * _WEEK_S + seconds)
+
+
+def _utc_of_gps(since_gps: Floats) -> Floats:
+    """Return UTC of seconds since the GPS epoch of 1980 (n,)."""
     time_s = _GPS_EPOCH_S + since_gps
     leap = np.full(time_s.shape, 13.0)
     for begin_s, count in _LEAPS:
@@ -132,48 +150,12 @@ def gps_times(weeks: Floats, seconds: Floats) -> Floats:
     return np.asarray(time_s - leap)
 
 
-def date_times(texts: Sequence[str], order: Order | None, zone: tzinfo | None) -> Times:
-    """Return times that are dates: ISO 8601, or days, months and years in some order.
-
-    Without a zone, in the text or given, they are read as UTC and `needs_zone` is set. Raise
-    ValueError, with the number of the row, for an invalid date.
-    """
-    parts = [_DATE.fullmatch(text) for text in texts]
-    order = order or _order([match for match in parts if match is not None])
-    micros = np.empty(len(texts))
-    is_local = np.zeros(len(texts), dtype=bool)
-    days: dict[tuple[str, str, str], float] = {}
-    for row, match in enumerate(parts):
-        if match is None:
-            if texts[row] in ("", "nan", "NaN"):
-                micros[row] = np.nan
-                continue
-            raise ValueError(row)
-        a, b, c, hour, minute, second, fraction, offset = match.groups()
-        day = days.get((a, b, c))
-        if day is None:
-            day = days[(a, b, c)] = _day_s(a, b, c, order, row)
-        value = day + 3600.0 * int(hour) + 60.0 * int(minute) + int(second or 0)
-        if offset is None:
-            is_local[row] = True
-        elif offset[0] in "+-":
-            value -= _offset_of(offset).total_seconds()
-        micros[row] = value * 1e6 + (
-            round(int(fraction) * 10.0 ** (6 - len(fraction))) if fraction else 0
-        )
-    time_s = micros / 1e6
-    if zone is not None and is_local.any():
-        time_s[is_local] = to_utc(time_s[is_local], zone)
-    return Times(time_s, "date", is_relative=False, order=order,
-                 needs_zone=zone is None and bool(is_local.any()))  # fmt: skip
-
-
 def zone_of(name: str, where: str) -> tzinfo:
     """Return a time zone by its name or its offset; InputError that begins with `where`."""
     if name.upper() in ("UTC", "Z", "GMT"):
         return UTC
     if _OFFSET.fullmatch(name):
-        return timezone(_offset_of(name))
+        return timezone(offset_of(name))
     try:
         return ZoneInfo(name)
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
@@ -251,8 +233,9 @@ def _even(time_s: Floats, rate_hz: float, where: str) -> Floats:
     start_s = None
     for piece in np.split(np.arange(time_s.size), gaps):
         local = np.arange(piece.size) / rate_hz
-        offset_s = float(np.mean(time_s[piece] - time_s[0] - local))
-        if np.abs(time_s[piece] - time_s[0] - local - offset_s).max() > 1.5 * resolution_s:
+        early = time_s[piece] - time_s[0] - local
+        offset_s = float(np.max(early) if resolution_s >= _COARSE_S else np.mean(early))
+        if np.abs(early - offset_s).max() > 1.5 * resolution_s:
             raise InputError(
                 f"{where}: stamps are repeated, and the samples between are not even at "
                 f"{rate_hz:g} Hz, as sensor.rate_hz declares"
@@ -264,27 +247,8 @@ def _even(time_s: Floats, rate_hz: float, where: str) -> Floats:
     return even
 
 
-def _order(matches: Sequence[re.Match[str]]) -> Order | None:
-    """Return the order of the parts of dates, None if several are possible."""
-    first = [match[1] for match in matches]
-    second = [match[2] for match in matches]
-    if all(len(one) == 4 for one in first):
-        return "ymd"
-    if (matches and "." in matches[0][0].split(":")[0]) or max(map(int, first), default=0) > 12:
-        return "dmy"
-    return "mdy" if max(map(int, second), default=0) > 12 else None
-
-
-def _day_s(a: str, b: str, c: str, order: Order | None, row: int) -> float:
-    year, month, day = {"ymd": (a, b, c), "dmy": (c, b, a), "mdy": (c, a, b)}[order or "dmy"]
-    try:
-        full = int(year) + (2000 if len(year) <= 2 else 0)
-        return datetime(full, int(month), int(day), tzinfo=UTC).timestamp()
-    except ValueError as error:
-        raise ValueError(row) from error
-
-
-def _offset_of(text: str) -> timedelta:
+def offset_of(text: str) -> timedelta:
+    """Return an offset to UTC, as +01:00; ValueError for another text."""
     match = _OFFSET.fullmatch(text)
     if match is None:
         raise ValueError(text)

@@ -406,6 +406,265 @@ VARIANTS: dict[str, Variant] = {
 }
 
 
+def quoted(text: str) -> str:
+    return "\n".join(",".join(f'"{c}"' for c in line.split(",")) for line in text.splitlines())
+
+
+def per_row(columns: Columns, name: str, form: Callable[[float], str]) -> dict[str, Any]:
+    return columns | {name: [form(float(value)) for value in columns[name]]}
+
+
+def sexagesimal(parts: int) -> dict[str, Any]:
+    """Fixes as degrees and minutes, or degrees, minutes and seconds, with a hemisphere."""
+
+    def form(value: float, side: str) -> str:
+        degree, minute = int(value), 60.0 * (value % 1.0)
+        if parts == 2:
+            return f"{degree}°{minute:.7f}' {side}"
+        return f"{side} {degree}°{int(minute)}'{60.0 * (minute % 1.0):.6f}\""
+
+    found = per_row(GPS, "latitude_deg", lambda v: form(v, "N"))
+    return found | per_row(found, "longitude_deg", lambda v: form(v, "E"))
+
+
+def nmea_fields() -> dict[str, Any]:
+    """Fixes as ddmm.mmmm with columns of hemispheres, and knots."""
+
+    def form(value: float) -> float:
+        return 100.0 * int(value) + 60.0 * (value % 1.0)
+
+    return {
+        "UTC": GPS["time_s"],
+        "Lat": [f"{form(v):.7f}" for v in GPS["latitude_deg"]],
+        "N/S": ["N"] * 70,
+        "Lon": [f"{form(v):.7f}" for v in GPS["longitude_deg"]],
+        "E/W": ["E"] * 70,
+        "Alt (m)": GPS["altitude_m"],
+        "Speed (kn)": GPS["speed_mps"] * 3600 / 1852,
+    }
+
+
+def thousands(number: float) -> str:
+    return f"{number:,.9f}".replace(",", "#").replace(".", ",").replace("#", ".")
+
+
+def triaxial() -> dict[str, Any]:
+    found: dict[str, Any] = {"Time": ACCEL["time_s"]}
+    for place, name in zip(
+        ("Body front", "Body rear", "Axle front", "Axle rear"), CHANNELS, strict=True
+    ):
+        found |= {f"{place} {axis} [m/s²]": 0.1 * ACCEL[name] for axis in "xy"}
+        found[f"{place} z [m/s²]"] = ACCEL[name]
+    return found
+
+
+def both(change: Callable[[str], str]) -> dict[str, str | bytes]:
+    return {A: change(table(ACCEL)), P: change(table(GPS))}
+
+
+FRENCH = ("Horodatage", "Caisse avant", "Caisse arrière", "Essieu avant", "Essieu arrière")
+TO_DEGREES = 180.0 / np.pi
+
+VARIANTS |= {
+    "tabs": Variant(lambda: pair(delimiter="\t"), note="delimiter tab"),
+    "quoted fields": Variant(lambda: both(quoted)),
+    "French names": Variant(
+        lambda: {
+            A: table(renamed(dates(ACCEL, "%d/%m/%Y %H:%M:%S,%f", 2.0), *FRENCH), ";", ","),
+            P: table(
+                renamed(
+                    dates(GPS, "%d/%m/%Y %H:%M:%S,%f", 2.0),
+                    *("Horodatage", "Latitude", "Longitude", "Altitude", "Vitesse"),
+                ),
+                ";",
+                ",",
+            ),
+        },
+        'sprung_rear is column "Caisse arrière"',
+        HowToRead(zone="Europe/Paris"),
+    ),
+    "left front and left rear": Variant(
+        lambda: pair(renamed(ACCEL, "Time", "Body_FL", "Body_RL", "Axle_FL", "Axle_RL")),
+        'unsprung_rear is column "Axle_RL"',
+    ),
+    "three axes": Variant(lambda: pair(triaxial()), 'sprung_front is column "Body front z'),
+    "mm/s² by the header": Variant(
+        lambda: pair(
+            renamed(scaled(1000.0), "t", *(name.format("mm/s²") for name in BODY)),
+        ),
+        "by the header in mm/s2",
+    ),
+    "in mm/s² with gravity": Variant(
+        lambda: pair(scaled(1000.0, 1000.0 * G)), "in mm/s2: their mean is"
+    ),
+    "ft/s² by the header": Variant(
+        lambda: pair(renamed(scaled(1 / 0.3048), "t", *(n.format("ft/s2") for n in BODY))),
+        "by the header in ft/s2",
+    ),
+    "thousands": Variant(
+        lambda: pair(
+            dict(
+                zip(
+                    ("t", *(name.format("mg") for name in BODY)),
+                    [
+                        ACCEL["time_s"],
+                        *(
+                            [thousands(v) for v in scaled(1000 / G, 1000)[name]]
+                            for name in CHANNELS
+                        ),
+                    ],
+                    strict=True,
+                )
+            ),
+            delimiter=";",
+            decimal=",",
+        ),
+        "by the header in mg",
+    ),
+    "AM and PM": Variant(
+        lambda: {
+            A: table(dates(ACCEL, "%m/%d/%Y %I:%M:%S.%f %p")),
+            P: table(dates(GPS, "%m/%d/%Y %I:%M:%S.%f %p")),
+        },
+        how=HowToRead(zone="UTC"),
+    ),
+    "names of months": Variant(
+        lambda: {
+            A: table(dates(ACCEL, "%d-%b-%Y %H:%M:%S.%f")),
+            P: table(dates(GPS, "%d. %B %Y %H:%M:%S.%f")),
+        },
+        how=HowToRead(zone="UTC"),
+    ),
+    "dates without separators": Variant(
+        lambda: {
+            A: table(dates(ACCEL, "%Y%m%dT%H%M%S.%fZ")),
+            P: table(dates(GPS, "%Y%m%d%H%M%S.%f+0000")),
+        }
+    ),
+    "hours of an offset only": Variant(lambda: pair(dates(ACCEL, ISO + "+02", 2.0))),
+    "CEST": Variant(lambda: pair(dates(ACCEL, ISO + " CEST", 2.0))),
+    "milliseconds after a colon": Variant(
+        lambda: {
+            A: table(
+                ACCEL
+                | {
+                    "time_s": [
+                        text[:-7] + ":" + text[-6:-3]
+                        for text in dates(ACCEL, "%Y-%m-%d %H:%M:%S.%f")["time_s"]
+                    ]
+                }
+            ),
+            P: table(GPS),
+        },
+        "times without a zone are UTC",
+    ),
+    "times of day": Variant(
+        lambda: {A: table(dates(ACCEL, "%H:%M:%S.%f")), P: table(dates(GPS, "%H:%M:%S.%f"))},
+        how=HowToRead(start="2026-09-21", zone="UTC"),
+    ),
+    "hours, minutes and seconds from 0": Variant(
+        lambda: {
+            name: table(
+                columns | {"time_s": [f"0:00:{s - START_S:09.6f}" for s in columns["time_s"]]}
+            )
+            for name, columns in ((A, ACCEL), (P, GPS))
+        },
+        how=HowToRead(start=str(START_S)),
+    ),
+    "days of MATLAB": Variant(
+        lambda: pair(per_row(ACCEL, "time_s", lambda s: f"{s / 86_400 + 719_529:.12f}")),
+        "times are matlab in days",
+        time_within_s=2e-5,
+    ),
+    "seconds since 1904": Variant(
+        lambda: pair(with_times(ACCEL, ACCEL["time_s"] + 2_082_844_800)), "since 1904 in s"
+    ),
+    "a counter beside times": Variant(
+        lambda: pair({"Index": np.arange(3500.0)} | ACCEL), note="not used: Index"
+    ),
+    "fixes in whole seconds": Variant(
+        lambda: pair(gps=with_times(GPS, np.floor(GPS["time_s"]))), "fixes even at 10 Hz"
+    ),
+    "blocks of one stamp": Variant(
+        lambda: pair(with_times(ACCEL, START_S + np.repeat(np.arange(70) / 10, 50))),
+        "stamps are rounded",
+    ),
+    "degrees and minutes": Variant(lambda: pair(gps=sexagesimal(2))),
+    "degrees, minutes and seconds": Variant(lambda: pair(gps=sexagesimal(3))),
+    "fields of NMEA": Variant(lambda: pair(gps=nmea_fields()), "speed is in knots"),
+    "longitude counted to the west": Variant(
+        lambda: pair(gps=GPS | {"longitude_deg": -GPS["longitude_deg"]}),
+        "longitude_deg has its sign turned",
+    ),
+    "radians": Variant(
+        lambda: pair(gps=GPS | {n: GPS[n] / TO_DEGREES for n in ("latitude_deg", "longitude_deg")}),
+        "coordinates are in rad",
+    ),
+    "speed in ft/s": Variant(
+        lambda: pair(gps=GPS | {"speed_mps": GPS["speed_mps"] / 0.3048}), "speed is in ft/s"
+    ),
+    "u-blox": Variant(
+        lambda: pair(
+            gps={
+                "time_s": GPS["time_s"],
+                "lat [1e-7 deg]": np.round(1e7 * GPS["latitude_deg"]),
+                "lon [1e-7 deg]": np.round(1e7 * GPS["longitude_deg"]),
+                "hMSL [mm]": 1000.0 * GPS["altitude_m"],
+                "gSpeed [mm/s]": 1000.0 * GPS["speed_mps"],
+            }
+        ),
+        "speed is in mm/s",
+    ),
+    "UTF-16 without a mark": Variant(
+        lambda: {A: table(ACCEL).encode("utf-16-le"), P: table(GPS).encode("utf-16-be")},
+        note="utf-16",
+    ),
+    "comments": Variant(
+        lambda: (
+            pair(before=["# Logger 7", "# Rate: 500 Hz"])
+            | {P: table(GPS).replace("\n", "\n# bridge\n", 30) + "End of data\n"}
+        ),
+        note="30 lines of comments, end text",
+    ),
+    "delimiters at the ends": Variant(
+        lambda: {A: table(ACCEL, ";").replace("\n", ";\n").replace(";\n", "\n", 1), P: table(GPS)}
+    ),
+    "mixed line ends": Variant(lambda: both(lambda text: text.replace("\n", "\r\n", 100))),
+    "words for no value": Variant(
+        lambda: {
+            A: table(per_row(ACCEL, "sprung_rear", repr)).replace(
+                repr(float(ACCEL["sprung_rear"][700])), "OVERLOAD"
+            ),
+            P: table(GPS),
+        },
+        note="1 rows with empty cells left out",
+        left_out=(slice(700, 701),),
+    ),
+    "9999 for no value": Variant(
+        lambda: pair(
+            ACCEL
+            | {"sprung_rear": np.where(np.arange(3500) // 3 == 200, -9999.0, ACCEL["sprung_rear"])}
+        ),
+        note="-9999 stands for no value in 3 cells",
+        left_out=(slice(600, 603),),
+    ),
+    "a last row that was cut off": Variant(
+        lambda: {A: table(ACCEL)[:-30], P: table(GPS)},
+        note="a cut-off row left out",
+        left_out=(slice(3499, 3500),),
+    ),
+    "header of another program": Variant(
+        lambda: pair(
+            renamed(ACCEL, "Zeit  1 - Standardmessrate", *FRENCH[1:]),
+            delimiter="\t",
+            decimal=",",
+            before=["HBM_CATMAN_DATAFILE_30", "T0: 21.09.2026 16:13:20", ""],
+        ),
+        "by their names",
+    ),
+}
+
+
 def written(folder: Path, files: dict[str, str | bytes]) -> Path:
     folder.mkdir(exist_ok=True)
     for name, content in files.items():
@@ -475,7 +734,11 @@ def test_vendor_table_gives_the_samples_of_the_exact_file(name: str, tmp_path: P
 
 @pytest.mark.parametrize(
     "name",
-    [name for name in VARIANTS if name not in ("exact", "other order", "BOM and CRLF", "gap")],
+    [
+        name
+        for name in VARIANTS
+        if name not in ("exact", "other order", "BOM and CRLF", "gap", "mixed line ends")
+    ],
 )
 def test_written_map_reads_the_same_without_a_guess(name: str, tmp_path: Path) -> None:
     variant = VARIANTS[name]
@@ -576,6 +839,55 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, str | bytes]], str]] = {
             P: table(GPS),
         },
         'accel_00.csv: line 9: column "sprung_rear" is "zwei", it must be a number',
+    ),
+    "volts": (
+        lambda: pair(renamed(scaled(0.1), "t", *(name.format("V") for name in BODY))),
+        'is in V, no acceleration: give sprung_front = { factor = 0.01, unit = "g" }',
+    ),
+    "counts of a converter": (
+        lambda: pair({n: np.rint(1e4 * v) if n in CHANNELS else v for n, v in ACCEL.items()}),
+        "whole numbers, as counts of a converter are: give factor",
+    ),
+    "mm/s² without a header": (lambda: pair(scaled(1000.0)), "mm/s2?), give it in a map (--map)"),
+    "several columns of one name": (
+        lambda: {
+            A: table(ACCEL | {"x": ACCEL["time_s"]}).replace("x\n", "sprung_rear\n", 1),
+            P: table(GPS),
+        },
+        "sprung_rear may be column",
+    ),
+    "times of day without a date": (
+        lambda: {A: table(dates(ACCEL, "%H:%M:%S.%f")), P: table(dates(GPS, "%H:%M:%S.%f"))},
+        "times of day have no date: give the midnight before them with --start",
+    ),
+    "seconds of the GPS week": (
+        lambda: pair(renamed(ACCEL, "TOW [s]", *CHANNELS)),
+        "seconds of a GPS week without its number: give week = 2437",
+    ),
+    "GPS seconds": (
+        lambda: pair(
+            renamed(with_times(ACCEL, ACCEL["time_s"] - 315_964_782), "GPS time", *CHANNELS)
+        ),
+        'give format = "unix_s" or "gps_s"',
+    ),
+    "18 s apart": (
+        lambda: pair(with_times(ACCEL, ACCEL["time_s"] + 18.0)),
+        "18 s is GPS time less UTC",
+    ),
+    "times of Windows": (
+        lambda: pair(
+            per_row(ACCEL, "time_s", lambda s: str(round(s * 1e7) + 116_444_736_000_000_000))
+        ),
+        "no known kind of time: give format",
+    ),
+    "decimal commas between commas": (
+        lambda: pair(delimiter=",", decimal=","),
+        "export it with semicolons or decimal points",
+    ),
+    "a spreadsheet": (lambda: pair() | {A: b"PK\x03\x04" + bytes(100)}, "save it as CSV"),
+    "sentences of NMEA": (
+        lambda: pair() | {P: "$GPRMC,141320.0,A,4700.0,N,00759.9,E,23.3,90.0,210926,,*00\n"},
+        "a log of NMEA sentences",
     ),
     "no positions": (
         lambda: {A: table(ACCEL, ";"), "b_00.csv": table(ACCEL, ";")},
@@ -692,3 +1004,45 @@ def test_preview_shows_guesses_rows_and_curves(tmp_path: Path) -> None:
     curves = [line for line in lines if "█" in line]
     assert len(curves) == 5
     assert all(len(line) <= 90 for line in curves)
+
+
+def test_uncalibrated_columns_are_read_by_a_factor(tmp_path: Path) -> None:
+    volts = renamed(scaled(1 / 40.0), "t", *(name.format("V") for name in BODY))
+    folder = written(tmp_path / "drive", pair(volts))
+    path = tmp_path / "map.toml"
+    keys = "\n".join(
+        f'{channel} = {{ column = "{name.format("V")}", factor = {40.0 / G!r}, unit = "g" }}'
+        for channel, name in zip(CHANNELS, BODY, strict=True)
+    )
+    path.write_text(f'[[file]]\nname = "accel_*.csv"\n[file.columns]\n{keys}\n')
+    how = HowToRead(load_map(path))
+    check(csv_runs([folder], site_of(), "truck-x", how)[0], VARIANTS["exact"], site_of())
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        (lambda: pair(gps=GPS | {"latitude_deg": GPS["latitude_deg"] + 20}), "no bridge of the"),
+        (lambda: pair(ACCEL | {"sprung_front": np.zeros(3500)}), "sprung_front never changes"),
+        (
+            lambda: pair(renamed(ACCEL, "time_s", *CHANNELS[2:], *CHANNELS[:2])),
+            "the front body shakes more than its axle",
+        ),
+        (
+            lambda: pair(gps=GPS | {"altitude_m": 1000 * GPS["altitude_m"]}),
+            "altitudes reach 400250 m: in another unit?",
+        ),
+        (
+            lambda: pair(gps=with_times(GPS, GPS["time_s"] + 2.0)),
+            "positions begin and end 2.0 s after the accelerations",
+        ),
+    ],
+)
+def test_strange_drive_is_noted_and_read(
+    files: Callable[[], dict[str, str | bytes]], words: str, tmp_path: Path
+) -> None:
+    found = understood_runs([written(tmp_path / "drive", files())], site_of(), "truck-x")
+    assert len(found.runs) == 1
+    assert any(words in guess.text for guess in found.guesses)
+    plain = understood_runs([written(tmp_path / "plain", pair())], site_of(), "truck-x")
+    assert plain.guesses == []
