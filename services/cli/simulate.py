@@ -140,14 +140,43 @@ def _add_surface(p: Any) -> None:
         metavar="M",
         help="lateral standard deviation between runs in m, on a 2-D surface (default: 0)",
     )
+    p.add_argument(
+        "--deck-roughness",
+        type=number("a factor", low=0.1, high=10),
+        metavar="FACTOR",
+        help="roughness on the bridge over that off it, on a 2-D surface (default: 1)",
+    )
+    p.add_argument(
+        "--joints",
+        type=number("a height in mm", low=0, high=50),
+        metavar="MM",
+        help="largest height in mm of a dip or step at each end of the bridge, on a 2-D surface "
+        "(default: 0)",
+    )
+    p.add_argument(
+        "--anisotropy",
+        type=number("a factor", low=0.2, high=20),
+        metavar="FACTOR",
+        help="lateral correlation length over that of an isotropic surface, on a 2-D surface "
+        "(default: 1)",
+    )
+
+
+_OF_PAVEMENT = ("deck_roughness", "joints", "anisotropy")
 
 
 def _on_surface(options: argparse.Namespace) -> Any:
+    from services.simulation.pavement import Pavement
     from services.simulation.wheel_paths import SurfaceOptions
 
     if options.road_surface:
-        return SurfaceOptions(options.tyres, options.rear_offset, options.wander or 0.0)
-    for name in ("tyres", "rear_offset", "wander"):
+        pavement = Pavement(
+            options.deck_roughness or 1.0,
+            1e-3 * (options.joints or 0.0),
+            options.anisotropy or 1.0,
+        )
+        return SurfaceOptions(options.tyres, options.rear_offset, options.wander or 0.0, pavement)
+    for name in ("tyres", "rear_offset", "wander", *_OF_PAVEMENT):
         if getattr(options, name) is not None:
             raise InputError(f"{option_of(name)}: only a --road-surface has it")
     return None
@@ -271,7 +300,8 @@ def _simulate_tandem(options: argparse.Namespace, site: Any) -> int:
     from services.simulation.lane import driven_lane
     from services.simulation.schedule import schedule_of
 
-    for name in ("bearing_stiffness", "departed_vehicle", "bilinear", "air_springs", "tyres"):
+    names = ("bearing_stiffness", "departed_vehicle", "bilinear", "air_springs", "tyres")
+    for name in (*names, *_OF_PAVEMENT):
         if getattr(options, name):
             raise InputError(f"{option_of(name)}: is not simulated for a truck with a tandem")
     begin, end = options.speed

@@ -4,6 +4,7 @@ from typing import Final
 
 EVERYTHING: Final = "everything"
 SURFACE: Final = "surface"
+PAVEMENT: Final = "pavement"
 AMONG_ALL: Final = (
     "free",
     "sprung",
@@ -17,7 +18,7 @@ AMONG_ALL: Final = (
 )
 TORSION: Final = "torsion"
 LEFT_AND_RIGHT: Final = "left-and-right"
-ON_SURFACES: Final = (SURFACE, TORSION, LEFT_AND_RIGHT)
+ON_SURFACES: Final = (SURFACE, TORSION, LEFT_AND_RIGHT, PAVEMENT)
 """Not parts of everything, whose answers on such a road would say little of the rest."""
 ALONE: Final = (*AMONG_ALL, *ON_SURFACES)
 EFFECTS: Final = (*ALONE, EVERYTHING)

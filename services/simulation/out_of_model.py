@@ -24,7 +24,10 @@ The ranges, uniform unless stated:
 - left-and-right: a truck that rolls, its load up to 6 cm off the centre line, on the same tyres and
   surface, with sensors left and right on both axles and in pairs on the body, whose gains differ,
   averaged to the four channels;
-- everything: all of these but the last three, each end sprung and the bridge continuous every other
+- pavement: such a surface whose deck is 0.4 to 4 times as rough as the road (log-uniform), with
+  dips or steps of up to 15 mm at its ends, and a lateral correlation length of 1 to 5 times that of
+  an isotropic surface (log-uniform);
+- everything: all of these but the last four, each end sprung and the bridge continuous every other
   time.
 """
 
@@ -46,11 +49,13 @@ from services.simulation.effects import (
     EFFECTS,
     EVERYTHING,
     LEFT_AND_RIGHT,
+    PAVEMENT,
     SURFACE,
     TORSION,
 )
+from services.simulation.pavement import PLAIN, Pavement
 from services.simulation.two_sided import Torsion
-from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
+from services.simulation.wheel_paths import SurfaceOptions, WheelPaths, wheel_paths_of
 from services.simulation.wide_crossings import WideSensor
 
 Floats = NDArray[np.float64]
@@ -74,6 +79,9 @@ LANE_OFFSET_M = (0.5, 2.0)
 TORSIONAL_RATIO = (1.3, 3.0)
 GYRATION_M = (1.8, 3.0)
 LOAD_LEFT_M = (-0.06, 0.06)
+DECK_ROUGHNESS = (0.4, 4.0)
+LARGEST_JOINT_M = (0.0, 0.015)
+ANISOTROPY = (1.0, 5.0)
 AXLE_SENSORS_M, BODY_SENSORS_M = 0.9, 0.4
 """Distance of sensors left and right from the centre line, on axles and body."""
 
@@ -114,6 +122,7 @@ def draw_out_of_model(site: Site, effect: str, seed: int) -> OutOfModelTruth:
     lane, ratio = side * float(rng.uniform(*LANE_OFFSET_M)), float(rng.uniform(*TORSIONAL_RATIO))
     gyration, load_left = float(rng.uniform(*GYRATION_M)), float(rng.uniform(*LOAD_LEFT_M))
     errors_of_pairs = rng.standard_normal((3, 8))
+    pavement = _draw_pavement(rng)
 
     alone = effect != EVERYTHING
 
@@ -144,17 +153,11 @@ def draw_out_of_model(site: Site, effect: str, seed: int) -> OutOfModelTruth:
     if has("friction"):
         conditions = conditions._replace(body_noise_ug_per_rthz=body_noise)
     paths = None
-    if has(SURFACE):
-        vehicle = site.vehicles[0]
-        unknown = vehicle.rear_axle_offset_m is None
-        options = SurfaceOptions(None, rear_offset if unknown else None, WANDER_M)
-        paths = wheel_paths_of(vehicle, options)
+    if has(SURFACE) or has(PAVEMENT):
+        paths = _paths(site, rear_offset, pavement if has(PAVEMENT) else PLAIN)
     width = None
     if has(TORSION) or has(LEFT_AND_RIGHT):
-        vehicle = site.vehicles[0]
-        unknown = vehicle.rear_axle_offset_m is None
-        options = SurfaceOptions(None, rear_offset if unknown else None, WANDER_M)
-        width = Width(wheel_paths_of(vehicle, options))
+        width = Width(_paths(site, rear_offset, PLAIN))
     if width is not None and has(TORSION):
         nominal = np.mean(site.bridges[0].nominal_flexural_rigidity_nm2)
         undamaged = beam._replace(
@@ -170,6 +173,22 @@ def draw_out_of_model(site: Site, effect: str, seed: int) -> OutOfModelTruth:
         car=car, beam=beam, conditions=conditions, left=beyond.left, paths=paths, width=width
     )
     return OutOfModelTruth(truth, site, beyond)
+
+
+def _draw_pavement(rng: np.random.Generator) -> Pavement:
+    def log_uniform(low: float, high: float) -> float:
+        return float(low * (high / low) ** rng.uniform())
+
+    roughness = log_uniform(*DECK_ROUGHNESS)
+    return Pavement(roughness, float(rng.uniform(*LARGEST_JOINT_M)), log_uniform(*ANISOTROPY))
+
+
+def _paths(site: Site, rear_offset_m: float, pavement: Pavement) -> WheelPaths:
+    """Return the wheel paths of the site's truck, with this rear offset if it declares none."""
+    vehicle = site.vehicles[0]
+    unknown = vehicle.rear_axle_offset_m is None
+    options = SurfaceOptions(None, rear_offset_m if unknown else None, WANDER_M, pavement)
+    return wheel_paths_of(vehicle, options)
 
 
 def with_single_tyres(site: Site) -> Site:

@@ -29,6 +29,12 @@ class SurveyKind(NamedTuple):
     """EI is that of this scenario of the paper, all elements at one level that is drawn; None: each
     element's is drawn."""
     noise_ug_per_rthz: float = 25.0
+    deck_roughness: float = 1.0
+    """Roughness of the pavement on the bridge over that of the road."""
+    largest_joint_m: float = 0.0
+    """Largest height of joints at both ends of the bridge."""
+    anisotropy: float = 1.0
+    """Lateral correlation length of the surface over that of an isotropic one."""
 
 
 KINDS: Final = {
@@ -43,6 +49,16 @@ KINDS: Final = {
     "both-ways": SurveyKind(12, tyres="twin", masses_kg=(_LORRY_KG,), both_ways=True),
     "five-elements": SurveyKind(12, tyres="twin", masses_kg=(_LORRY_KG,), elements=5),
     "three-elements": SurveyKind(12, tyres="twin", masses_kg=(_LORRY_KG,), elements=3),
+    "twin-rough-deck": SurveyKind(
+        10, tyres="twin", masses_kg=(_LORRY_KG,), deck_roughness=2.5, largest_joint_m=0.015
+    ),
+    "twin-smooth-deck": SurveyKind(10, tyres="twin", masses_kg=(_LORRY_KG,), deck_roughness=0.5),
+    "single-rough-deck": SurveyKind(
+        10, tyres="single", masses_kg=(_LORRY_KG,), deck_roughness=2.5, largest_joint_m=0.015
+    ),
+    "single-smooth-deck": SurveyKind(
+        10, tyres="single", masses_kg=(_LORRY_KG,), deck_roughness=0.5
+    ),
     "everything": SurveyKind(16, tyres="twin", masses_kg=(_LORRY_KG,), everything=True),
     "scenario-1": SurveyKind(16, scenario=1, noise_ug_per_rthz=100.0),
     "scenario-4": SurveyKind(16, scenario=4, noise_ug_per_rthz=100.0),

@@ -11,10 +11,23 @@ import numpy as np
 
 from pre_core.physics.road import Profile
 from pre_core.physics.simulate import Motion
-from pre_core.physics.surface import TYPICAL_FOOTPRINTS, Footprint, axle_profile, random_surface
+from pre_core.physics.surface import (
+    TYPICAL_FOOTPRINTS,
+    Footprint,
+    Surface,
+    axle_profile,
+    random_surface,
+)
 from schemas.site import Bridge, Vehicle
 from services.common.errors import InputError
 from services.identification.footprints import footprints_of
+from services.simulation.pavement import (
+    PLAIN,
+    Pavement,
+    joint_heights,
+    on_stretched_surface,
+    with_deck,
+)
 
 REAR_OFFSET_M: Final = 0.005
 """Lateral offset of the rear axle; axles are aligned to millimetres."""
@@ -32,6 +45,7 @@ class SurfaceOptions(NamedTuple):
     """Rear tyres: "single" or "twin" (the default)."""
     rear_offset_m: float | None = None
     wander_m: float = 0.0
+    pavement: Pavement = PLAIN
 
 
 USUAL: Final = SurfaceOptions()
@@ -44,6 +58,7 @@ class WheelPaths(NamedTuple):
     rear: Footprint
     wander_m: float = 0.0
     """Lateral wander: standard deviation of the truck's position from run to run."""
+    pavement: Pavement = PLAIN
 
 
 class AxleRoads(NamedTuple):
@@ -71,7 +86,7 @@ def wheel_paths_of(vehicle: Vehicle, asked: SurfaceOptions = USUAL) -> WheelPath
     if offset_m is None:
         offset_m = REAR_OFFSET_M if asked.rear_offset_m is None else asked.rear_offset_m
     front, rear = footprints_of(vehicle, (_SINGLE, _BEHIND[behind]))
-    return WheelPaths(front, rear._replace(offset_m=offset_m), asked.wander_m)
+    return WheelPaths(front, rear._replace(offset_m=offset_m), asked.wander_m, asked.pavement)
 
 
 def roads_of_surface(
@@ -94,9 +109,37 @@ def roads_of_surface(
     beside = paths.wander_m * float(rng.standard_normal())
     # The left of a returning truck is the right of the line.
     sign = 1.0 if motion.speed_m_per_s[0] >= 0.0 else -1.0
-    return AxleRoads(
-        *(
-            axle_profile(surface, axle._replace(offset_m=sign * axle.offset_m), beside)
-            for axle in (paths.front, paths.rear)
+    front, rear = (
+        _profile_under(
+            surface, axle._replace(offset_m=sign * axle.offset_m), beside, paths.pavement
         )
+        for axle in (paths.front, paths.rear)
     )
+    if paths.pavement.deck_roughness != 1.0:
+        factor = paths.pavement.deck_roughness
+        front, rear = (with_deck(one, bridge.span_m, factor) for one in (front, rear))
+    if paths.pavement.largest_joint_m > 0.0:
+        front, rear = (
+            one._replace(
+                height_m=one.height_m
+                + joint_heights(
+                    one.x_m,
+                    bridge.span_m,
+                    paths.pavement.largest_joint_m,
+                    axle._replace(offset_m=sign * axle.offset_m + beside),
+                    road[1],
+                )
+            )
+            for one, axle in ((front, paths.front), (rear, paths.rear))
+        )
+    return AxleRoads(front, rear)
+
+
+def _profile_under(
+    surface: Surface, axle: Footprint, beside_m: float, pavement: Pavement
+) -> Profile:
+    """Return the profile of an axle on the surface, stretched laterally."""
+    if pavement.anisotropy == 1.0:
+        return axle_profile(surface, axle, beside_m)
+    stretched = on_stretched_surface(axle, pavement.anisotropy)
+    return axle_profile(surface, stretched, beside_m / pavement.anisotropy)

@@ -108,9 +108,9 @@ _WORLDS = """
 ## More physics than the method has
 
 Crossings whose truck and bridge are drawn as above, but on free and rigid bearings and undamped
-tyres; then with one effect, or with all but the surface, torsion and left-and-right, which are on
-roads of their own. What is drawn from which range is written in
-`services/simulation/out_of_model.py`; no range is a prior of the method. Answered is what is not
+tyres; then with one effect, or with all but the surface, torsion, left-and-right and pavement,
+which are on roads of their own. The ranges are in `services/simulation/out_of_model.py`; none is a
+prior of the method. Answered is what is not
 rejected; covered is the share of the 95 % intervals of EI that hold the truth, of all that were
 answered and of those that are `good`; z is the error over the standard deviation: its mean over all
 elements and that of the worst element, its root mean square (rms), and its largest size where the

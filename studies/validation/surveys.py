@@ -25,6 +25,7 @@ from services.identification.bridge_state import RecentCrossings, add_crossings,
 from services.simulation.drawn import CrossingTruth, draw_truth, drive, identify_simulated
 from services.simulation.drive import declared_site, ratios_of
 from services.simulation.out_of_model import draw_out_of_model
+from services.simulation.pavement import Pavement
 from services.simulation.survey_kinds import KINDS, SurveyKind
 from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
 from studies.validation.calibration import Aim, Record
@@ -48,8 +49,8 @@ def one_crossing(
     """Simulate and identify one crossing of a survey."""
     of = KINDS[kind]
     truck = number % len(of.masses_kg)
-    site = _site_of(site, of, truck)
-    truth, seed = _truth(site, of, survey, number, truck)
+    site = site_of_truck(site, of, truck)
+    truth, seed = crossing_truth(site, of, survey, number, truck)
     drawn = drive(site, truth, seed)
     found = identify_simulated([drawn.run], drawn.site, settings)
     crossing = None
@@ -75,7 +76,7 @@ def one_crossing(
     }
 
 
-def _site_of(site: Site, kind: SurveyKind, truck: int) -> Site:
+def site_of_truck(site: Site, kind: SurveyKind, truck: int) -> Site:
     """Return the owner's site file for a truck of a survey."""
     vehicle, bridge = site.vehicles[0], site.bridges[0]
     mass = kind.masses_kg[truck]
@@ -91,7 +92,7 @@ def sites_of(site: Site, kind: SurveyKind) -> list[Site]:
     axles = kind.noise_ug_per_rthz
     body = _BODY_NOISE_UG if kind.everything else axles
     return [
-        declared_site(_site_of(site, kind, truck), (body, body, axles, axles), _RATE_HZ)
+        declared_site(site_of_truck(site, kind, truck), (body, body, axles, axles), _RATE_HZ)
         for truck in range(len(kind.masses_kg))
     ]
 
@@ -115,7 +116,7 @@ def _of_mass(vehicle: Vehicle, mass: float) -> Vehicle:
     )
 
 
-def _truth(
+def crossing_truth(
     site: Site, kind: SurveyKind, survey: int, number: int, truck: int
 ) -> tuple[CrossingTruth, int]:
     """Return the truth of a crossing, and the seed of its noise."""
@@ -152,7 +153,8 @@ def _truth(
     )
     paths = None
     if kind.tyres is not None:
-        asked = SurfaceOptions(kind.tyres, kind.offset_m, kind.wander_m)
+        pavement = Pavement(kind.deck_roughness, kind.largest_joint_m, kind.anisotropy)
+        asked = SurfaceOptions(kind.tyres, kind.offset_m, kind.wander_m, pavement)
         paths = wheel_paths_of(site.vehicles[0], asked)
     beam = bridge._replace(flexural_rigidity_nm2=bridge.flexural_rigidity_nm2 * np.exp(change))
     truth = same._replace(car=car, beam=beam, conditions=conditions, left=left, paths=paths)
@@ -193,7 +195,7 @@ def run_surveys(
         for number in range(KINDS[kind].crossings)
     ]
     identities = {
-        (kind, truck): identity_of(_site_of(site, KINDS[kind], truck), settings)
+        (kind, truck): identity_of(site_of_truck(site, KINDS[kind], truck), settings)
         for kind in kinds
         for truck in range(len(KINDS[kind].masses_kg))
     }

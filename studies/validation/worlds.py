@@ -84,6 +84,7 @@ def one_world(site: Site, effect: str, seed: int, settings: IdentificationSettin
                 "front": paths.front._asdict(),
                 "rear": paths.rear._asdict(),
                 "wander_m": paths.wander_m,
+                "pavement": paths.pavement._asdict(),
             },
             "width": None if world.truth.width is None else _width_of(world.truth.width),
             "friction_length_m": world.truth.car.friction_length_m,

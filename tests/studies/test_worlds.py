@@ -20,6 +20,7 @@ from services.simulation.drawn import default_site, draw_truth
 from services.simulation.drive_wide import deck_with_width, truck_with_width
 from services.simulation.effects import ALONE, EVERYTHING, ON_SURFACES
 from services.simulation.out_of_model import OutOfModelTruth, draw_out_of_model
+from services.simulation.pavement import PLAIN
 from services.simulation.two_sided import bending_frequencies_hz
 from services.simulation.two_sided import static_axle_loads_n as static_loads
 from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
@@ -80,7 +81,8 @@ def test_an_effect_alone_changes_nothing_else(effect: str) -> None:
             "bilinear": world.truth.car.bilinear_damping > 0.0,
             "air": world.truth.car.air_spring_exponent > 0.0,
             "spans": bool(world.site.bridges[0].interior_supports_m),
-            "surface": world.truth.paths is not None,
+            "surface": world.truth.paths is not None and world.truth.paths.pavement == PLAIN,
+            "pavement": world.truth.paths is not None and world.truth.paths.pavement != PLAIN,
             "torsion": world.truth.width is not None and world.truth.width.torsion is not None,
             "left-and-right": world.truth.width is not None and bool(world.truth.width.sensors),
         }
@@ -114,6 +116,18 @@ def test_ranges_are_those_that_are_stated() -> None:
     assert within(
         [w.truth.car.air_spring_exponent for w in drawn("air")], out_of_model.AIR_EXPONENT
     )
+
+
+def test_ranges_of_pavements_are_those_that_are_stated() -> None:
+    pavements = [w.truth.paths.pavement for w in drawn("pavement") if w.truth.paths]
+    for name, limits in (
+        ("deck_roughness", out_of_model.DECK_ROUGHNESS),
+        ("anisotropy", out_of_model.ANISOTROPY),
+    ):
+        low, high = np.log(limits)
+        found = np.log([getattr(one, name) for one in pavements])
+        assert within(found, (float(low), float(high)))
+    assert within([one.largest_joint_m for one in pavements], out_of_model.LARGEST_JOINT_M)
 
 
 def test_spans_are_continuous_bridges_from_the_same_start() -> None:
