@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from pre_core.crossing.fit import chi2_per_dof
 from pre_core.crossing.noise import FRICTION_GAIN_OF_MISFIT, no_force_noise
+from pre_core.crossing.off_bridge import levels_at, rear_axle_chainage_m
 from pre_core.crossing.posterior import PosteriorProblem, all_rows, data_rows, layout
 from pre_core.crossing.preparation import (
     CrossingInputs,
     build_problem,
-    levels_at,
-    rear_axle_chainage_m,
     to_standardised,
     update_noise,
     with_lines_of,

@@ -43,6 +43,8 @@ _EVERY_LONG, _OTHERS = 30, 50
 """Number of longest grid waves, and of others, for which the shared part is computed; it is smooth.
 """
 _SURFACE_CYCLES_PER_M = (0.5, 4.0)
+_TILTED_CYCLES_PER_M, _PIVOT_CYCLES_PER_M = (0.05, 4.0), 1.0
+"""Waves between which the pavement of a bridge is tilted, and n_p."""
 _ENOUGH = 1e-4
 _NOTHING = 1e-12
 
@@ -69,12 +71,25 @@ class MismatchSpectra(NamedTuple):
     `_LARGE_OFFSET_M`."""
 
 
+class BridgePavement(NamedTuple):
+    """The mismatch on the bridge relative to that off it, see `crossing.pavement`."""
+
+    ratio_and_tilt: FloatArray
+    """Estimates (2,) of r and t."""
+    covariance: FloatArray
+    """Posterior covariance (2, 2) of r and t."""
+    share: FloatArray
+    """Share (m,) of each filtered residual's mismatch that is the bridge's, 0 to 1."""
+
+
 class Mismatch(NamedTuple):
     """The mismatch noise of one run; without mismatch all levels are zero."""
 
     shapes: MismatchSpectra
     level_m3: FloatArray  # (s,)
     speed_m_per_s: float
+    pavement: BridgePavement | None = None
+    """Difference of the bridge's pavement; None where it is the road's."""
 
 
 @lru_cache(maxsize=8)
@@ -189,6 +204,29 @@ def front_cross_spectrum(mismatch: Mismatch, omega: FloatArray) -> FloatArray:
     return mismatch.level_m3 @ density_at(
         mismatch, omega, mismatch.shapes.front_cross_spectrum_density
     )
+
+
+def tilt_of(cycles_per_m: FloatArray) -> FloatArray:
+    """Return L (…) of `crossing.pavement` at wave numbers (…)."""
+    low, high = _TILTED_CYCLES_PER_M
+    return np.asarray(np.log(np.clip(cycles_per_m, low, high) / _PIVOT_CYCLES_PER_M))
+
+
+def on_bridge(mismatch: Mismatch) -> Mismatch:
+    """Return the mismatch as it is expected on the bridge, as one shape of level 1."""
+    if mismatch.pavement is None:
+        return mismatch
+    shapes, pavement = mismatch.shapes, mismatch.pavement
+    tilt = tilt_of(shapes.cycles_per_m)
+    columns = np.stack([np.ones_like(tilt), tilt], axis=1)
+    variance = np.einsum("gi,ij,gj->g", columns, pavement.covariance, columns)
+    factor = np.exp(2.0 * (columns @ pavement.ratio_and_tilt + variance))
+    level = mismatch.level_m3
+    changed = shapes._replace(
+        density=_windowed(factor * (level @ shapes.density))[None, :],
+        front_cross_spectrum_density=factor * (level @ shapes.front_cross_spectrum_density)[None],
+    )
+    return Mismatch(changed, np.ones(1), mismatch.speed_m_per_s)
 
 
 def two_parameter_spectrum(mismatch: Mismatch) -> tuple[float, float]:

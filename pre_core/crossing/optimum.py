@@ -24,6 +24,7 @@ from pre_core.crossing.fit import (
     resting_mode_indices,
 )
 from pre_core.crossing.noise import no_force_noise
+from pre_core.crossing.off_bridge import levels_at, off_bridge_residuals
 from pre_core.crossing.posterior import (
     PosteriorProblem,
     all_rows,
@@ -35,8 +36,6 @@ from pre_core.crossing.posterior import (
 from pre_core.crossing.preparation import (
     CrossingInputs,
     build_problem,
-    levels_at,
-    off_bridge_residuals,
     strongest_line_at_hz,
     update_noise,
     with_line,

@@ -8,23 +8,23 @@ import numpy as np
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import lines
 from pre_core.crossing.channels import A, channel_signals
-from pre_core.crossing.mismatch import Mismatch, mismatch_spectra
+from pre_core.crossing.mismatch import BridgePavement, Mismatch, mismatch_spectra
 from pre_core.crossing.noise import (
     FRICTION_GAIN,
     NoisePath,
     force_noise,
-    mismatch_levels,
     mismatch_power,
     no_force_noise,
     noise_path,
     noise_power,
 )
+from pre_core.crossing.off_bridge import levels_at
+from pre_core.crossing.pavement import estimate_pavement, parts_of, without_joints
 from pre_core.crossing.posterior import (
     ChainageFixes,
     PosteriorProblem,
     Priors,
     data_rows,
-    filtered_rear_road,
     filtered_rows,
     has_tandem,
     layout,
@@ -46,7 +46,6 @@ from pre_core.crossing.whitening import Whitener, solve, whitener
 from pre_core.parameters import FIRST_OF_BRIDGE, TORSION
 from pre_core.physics.beam_basis import beam_basis, change_basis
 from pre_core.physics.bridge import FloatArray
-from pre_core.physics.simulate import rear_position_m
 from pre_core.physics.surface import TYPICAL_FOOTPRINTS, Footprint
 from pre_core.physics.tandem import NO_LEAD, Lead, shared_load
 from pre_core.physics.torsion import NO_TORSION, torsion_basis
@@ -64,12 +63,6 @@ _REDUCED_WEIGHT_FACTOR = 100.0
 truck's motion, and could pass for a heavier end or another centre of gravity. Without the factor EI
 was 0.34 standard deviations too low (the median of 36 crossings with friction) and the coverage 93
 %; with it 0.09 and 97 %, with intervals of the same width."""
-
-_FEWEST_ROWS = 24
-"""Fewest residuals off the bridge, in one segment, that determine the mismatch."""
-_STEP_SAMPLES = 9
-MIN_MISMATCH_GAIN = 30.0
-"""Smallest gain in twice the log-likelihood of the residuals off the bridge."""
 
 
 class CrossingInputs(NamedTuple):
@@ -197,12 +190,14 @@ def update_noise(
     force: FloatArray | None = None,
     friction_gain: float = FRICTION_GAIN,
     mismatch: FloatArray | None = None,
+    pavement: BridgePavement | None = None,
 ) -> PosteriorProblem:
     """Return the problem with the noise for the truck at y (size,), and bridge coordinates for it.
 
     The suspension noise is `force` (2, shapes), by default that of the body equations at y if it is
     at least `friction_gain` (`force_noise`). Mismatch levels are `mismatch` (s,), by default those
-    of the residuals off the bridge at y if the problem has levels already.
+    of the residuals off the bridge at y if the problem has levels already. With mismatch, that on
+    the bridge is `pavement`, by default estimated at y.
     """
     where = layout(problem)
     unknowns = where.gains.stop
@@ -216,21 +211,27 @@ def update_noise(
         mismatch = problem.mismatch.level_m3
         if mismatch.any():
             mismatch = levels_at(problem, y)
-    road = problem.mismatch._replace(level_m3=mismatch)
+    differs = bool(mismatch.any())
+    if differs and pavement is None:
+        pavement = estimate_pavement(problem, y, mismatch)
+    road = problem.mismatch._replace(level_m3=mismatch, pavement=pavement if differs else None)
     is_inertial = bool(force.any())
     at, trucks = _displaced_points(problem, y, unknowns, is_inertial=is_inertial)
     density = problem.density * (1.0 + at.gain)
     count = row_count(problem.rows, problem.crossing.rows)
     residual_force = _REDUCED_WEIGHT_FACTOR * force
-    profile_noise = road if mismatch.any() else None
+    profile_noise = road if differs else None
     noise = whitener(problem.rows, count, trucks[0], density[0], residual_force, profile_noise)
     noise = _without_lines(problem, noise)
+    if differs:
+        noise = without_joints(problem, y, noise)
     truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
     changing = [*range(truck), *range(where.wheelbase, unknowns)]
     slope = np.zeros(unknowns)
-    power = noise_power(problem.rows, trucks, density, residual_force, changing, profile_noise)
-    slope[changing] = 0.5 * count * power / _SLOPE_STEP
-    if profile_noise is not None:
+    for part, number in parts_of(road, count) if differs else [(None, float(count))]:
+        power = noise_power(problem.rows, trucks, density, residual_force, changing, part)
+        slope[changing] += 0.5 * number * power / _SLOPE_STEP
+    if differs:
         slope = np.concatenate([slope, np.zeros(where.delays.stop - unknowns)])
         slope += mismatch_gradient(problem._replace(force=force, mismatch=road), y)
     basis = change_basis(problem.crossing.basis, at.theta[0])
@@ -277,7 +278,8 @@ def replace_mismatch(
         _REDUCED_WEIGHT_FACTOR * problem.force,
         mismatch,
     )
-    return problem._replace(noise=_without_lines(problem, noise))
+    noise = _without_lines(problem, noise)
+    return problem._replace(noise=without_joints(problem, y, noise))
 
 
 def strongest_line_at_hz(problem: PosteriorProblem, y: FloatArray) -> float:
@@ -354,58 +356,22 @@ def mismatch_gradient(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
         *range(where.wheelbase, where.gains.stop),
         *range(where.delays.start, where.delays.stop),
     ]
-    power = mismatch_power(
-        problem.rows,
-        trucks,
-        at.gain,
-        at.delay_s,
-        problem.density * (1.0 + at.gain[0]),
-        _REDUCED_WEIGHT_FACTOR * problem.force,
-        problem.mismatch,
-        float(at.wheelbase_m[0]),
-        changing,
-    )
     slope = np.zeros(where.delays.stop)
-    slope[changing] = row_count(problem.rows, problem.crossing.rows) * power / _SLOPE_STEP
+    count = row_count(problem.rows, problem.crossing.rows)
+    for part, number in parts_of(problem.mismatch, count):
+        power = mismatch_power(
+            problem.rows,
+            trucks,
+            at.gain,
+            at.delay_s,
+            problem.density * (1.0 + at.gain[0]),
+            _REDUCED_WEIGHT_FACTOR * problem.force,
+            part,
+            float(at.wheelbase_m[0]),
+            changing,
+        )
+        slope[changing] += number * power / _SLOPE_STEP
     return slope
-
-
-def levels_at(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
-    """Return the mismatch levels (s,) of the residuals off the bridge at y (size,).
-
-    They are zero where too few residuals exist, or where a mismatch explains them no better
-    (`MIN_MISMATCH_GAIN`).
-    """
-    level, gain, _ = _levels_off_bridge(problem, y)
-    return level if gain > MIN_MISMATCH_GAIN else np.zeros_like(level)
-
-
-def mismatch_excess(problem: PosteriorProblem, y: FloatArray) -> float:
-    """Return the power of the mismatch off the bridge over that of declared axles, at y (size,).
-
-    The ratio refers to waves of ten metres on a surface as rough as the road at y; it is 0 without
-    an estimate.
-    """
-    level, _, expected = _levels_off_bridge(problem, y)
-    return float(level.sum() / expected.sum()) if expected.sum() > 0.0 else 0.0
-
-
-def _levels_off_bridge(
-    problem: PosteriorProblem, y: FloatArray
-) -> tuple[FloatArray, float, FloatArray]:
-    """Return the results of `mismatch_levels` for the segments before and behind the bridge."""
-    some = [one for one in off_bridge_residuals(problem, y) if one.stop - one.start >= _FEWEST_ROWS]
-    if not some:
-        nothing = np.zeros_like(problem.mismatch.level_m3)
-        return nothing, 0.0, nothing
-    differ, felt = filtered_rows(problem, y)[0], filtered_rear_road(problem, y)
-    return mismatch_levels(
-        problem.rows,
-        *noise_path_at(problem, y),
-        problem.mismatch,
-        [differ[one] for one in some],
-        [felt[one] for one in some],
-    )
 
 
 def to_standardised(priors: Priors, theta: FloatArray) -> FloatArray:
@@ -416,33 +382,3 @@ def to_standardised(priors: Priors, theta: FloatArray) -> FloatArray:
     zero = np.flatnonzero(priors.estimated & priors.half_normal)
     values[zero] = theta[zero] / priors.spread[zero]
     return values[priors.estimated]
-
-
-def rear_axle_chainage_m(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
-    """Return the rear axle's chainage at the middle of each filtered residual (m,) at y (size,)."""
-    crossing, rows = problem.crossing, problem.rows
-    at = points(problem, y[None, :])
-    rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), crossing.direction)
-    count = row_count(rows, crossing.rows)
-    return rear[crossing.first_row + rows.taps.size // 2 + rows.every * np.arange(count)]
-
-
-def compared_length_m(problem: PosteriorProblem, y: FloatArray) -> float:
-    """Return the length of road compared by usable residuals off the bridge, at y (size,)."""
-    rows = [one.stop - one.start for one in off_bridge_residuals(problem, y)]
-    apart_m = problem.rows.every * problem.rows.step_s * problem.mismatch.speed_m_per_s
-    return apart_m * sum(one for one in rows if one >= _FEWEST_ROWS)
-
-
-def off_bridge_residuals(problem: PosteriorProblem, y: FloatArray) -> tuple[slice, slice]:
-    """Return the slices of filtered residuals before and behind the bridge, at y (size,)."""
-    at = points(problem, y[None, :])
-    crossing, rows = problem.crossing, problem.rows
-    rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), crossing.direction)
-    travel = (rear if crossing.direction > 0 else crossing.span_m - rear)[crossing.first_row :]
-    on, left = np.searchsorted(travel, [0.0, crossing.span_m])
-    count = row_count(rows, crossing.rows)
-    # A compliant bearing affects some samples before and behind the end.
-    last = (int(on) - _STEP_SAMPLES - rows.taps.size) // rows.every + 1
-    first = -((-int(left) - _STEP_SAMPLES) // rows.every)
-    return slice(0, min(max(0, last), count)), slice(min(max(0, first), count), count)

@@ -47,11 +47,14 @@ def whitener(
     `force` (2, shapes) is the suspension noise in N²/Hz (`no_force_noise` without any), `road` the
     mismatch. Raise ValueError where the densities leave some residual without noise.
     """
-    spectrum = noise_spectrum(truck, density, force, road, rows.omega) * rows.power
+    has_pavement = road is not None and road.pavement is not None
+    everywhere = None if has_pavement else road
+    spectrum = noise_spectrum(truck, density, force, everywhere, rows.omega) * rows.power
     memory = FORCE_MEMORY_S if force.any() else 0.0
     if road is not None:
         memory = max(memory, _mismatch.correlation_time_s(road))
-    covariance = np.real(spectrum @ phases(rows, memory))  # E[e_i(t + lag) e_j(t)]
+    turn = phases(rows, memory)
+    covariance = np.real(spectrum @ turn)  # E[e_i(t + lag) e_j(t)]
     lags = covariance.shape[2]
     band = RESIDUALS * lags - 1
     one = np.zeros((RESIDUALS, band + 1))
@@ -61,26 +64,55 @@ def whitener(
                 offset = RESIDUALS * lag + i - j  # row (k + lag, i) against column (k, j)
                 if 0 <= offset <= band:
                     one[i, band - offset] = covariance[i, j, lag]
+    differing, weight = np.zeros((0, lags)), np.zeros((0, count))
+    if road is not None and road.pavement is not None:
+        differing, weight = _off_and_on_bridge(road, rows, turn)
     diagonal = one[:, band].copy()
     for more in _RIDGES:
         one[:, band] = diagonal * (1.0 + more)
+        ridged = differing.copy()
+        ridged[:, 0] *= 1.0 + more
         factor = np.zeros((RESIDUALS * count, band + 1))
-        if _cholesky(one, factor):
+        if _cholesky(one, ridged, weight, factor):
             return Whitener(factor, 1.0 / factor[:, band])
     raise ValueError("the noise covariance is not positive: are all densities above zero?")
 
 
+def _off_and_on_bridge(
+    road: Mismatch, rows: RowFilter, turn: NDArray[np.complex128]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the autocovariances (2, lags) of the mismatch off and on the bridge, and weights.
+
+    The weights (2, m) are those of both, which are independent, in each filtered residual.
+    """
+    if road.pavement is None:
+        raise ValueError("the bridge has the road's pavement")
+    both = np.stack(
+        [_mismatch.spectrum(one, rows.omega) for one in (road, _mismatch.on_bridge(road))]
+    )
+    share = road.pavement.share
+    covariance = np.ascontiguousarray(((both * rows.omega**4 * rows.power) @ turn).real)
+    return covariance, np.sqrt(np.stack([1.0 - share, share]))
+
+
 @summing
-def _cholesky(one: FloatArray, a: FloatArray) -> bool:
+def _cholesky(one: FloatArray, differing: FloatArray, weight: FloatArray, a: FloatArray) -> bool:
     """Factor the banded covariance that repeats the rows `one` (3, band + 1) to a (n, band + 1).
 
-    Rows of the factor converge to rows that repeat too; from there on they are copied.
+    To the first kind of rows are added covariances `differing` (k, lags) with weights (k, m). Rows
+    of the factor converge to rows that repeat too; from there on they are copied, until the weights
+    change.
     """
     n, width = a.shape
     band = width - 1
     kinds = one.shape[0]
     settled = False
     for i in range(n):
+        group = i // kinds
+        if settled and i % kinds == 0:
+            for p in range(weight.shape[0]):
+                if weight[p, group] != weight[p, group - 1]:
+                    settled = False
         if settled:
             for j in range(width):
                 a[i, j] = a[i - kinds, j]
@@ -89,6 +121,10 @@ def _cholesky(one: FloatArray, a: FloatArray) -> bool:
         for j in range(max(0, i - band), i + 1):
             low = max(0, i - band)  # columns before it are zero in row i
             total = one[i % kinds, j - i + band]
+            if i % kinds == 0 and j % kinds == 0:
+                for p in range(weight.shape[0]):
+                    both = weight[p, group] * weight[p, j // kinds]
+                    total += both * differing[p, group - j // kinds]
             x = a[i, low - i + band : j - i + band]
             y = a[j, low - j + band : band]
             for k in range(x.size):

@@ -33,7 +33,8 @@ from pre_core.crossing.compliances import (
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.lines import project_out
 from pre_core.crossing.mismatch import CORRELATION_LENGTH_M, Mismatch
-from pre_core.crossing.preparation import off_bridge_residuals, replace_mismatch
+from pre_core.crossing.off_bridge import off_bridge_residuals
+from pre_core.crossing.preparation import replace_mismatch
 from pre_core.crossing.residuals import EvaluationPoints, GriddedCrossing, evaluate
 from pre_core.crossing.rows import RESIDUALS, filter_rows, row_count
 from pre_core.crossing.splines import basis

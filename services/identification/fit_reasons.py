@@ -12,7 +12,7 @@ from pre_core import parameters
 from pre_core.crossing import posterior, shaking, slip, speeds
 from pre_core.crossing.compliances import MISMATCH_BIAS_SPREAD, mismatch_bias
 from pre_core.crossing.fit import Optimum, normal_approximation
-from pre_core.crossing.preparation import compared_length_m, mismatch_excess, rear_axle_chainage_m
+from pre_core.crossing.off_bridge import compared_length_m, mismatch_excess, rear_axle_chainage_m
 from pre_core.crossing.rows import RESIDUALS
 from pre_core.search.loop import Termination
 from schemas.reasons import Reason

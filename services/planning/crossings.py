@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from pre_core.crossing import posterior
 from pre_core.crossing.mismatch import Mismatch, expected_levels, mismatch_spectra
-from pre_core.crossing.preparation import build_problem, compared_length_m
+from pre_core.crossing.off_bridge import compared_length_m
+from pre_core.crossing.preparation import build_problem
 from pre_core.physics.surface import Footprint
 from pre_core.survey.plan import (
     BridgePrior,

@@ -9,7 +9,8 @@ normal about the true value truncated at zero, with its effect on the others
 
 Where the axles run over a surface their profiles differ, which is noise of the level that the road
 class and the tyres imply: no run determines it better. The part common to several runs of one
-wheel-path group is a parameter of all of them (`bound_of_runs`).
+wheel-path group is a parameter of all of them (`bound_of_runs`). The ratio of the deck's roughness
+to the road's is known.
 """
 
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from pre_core.crossing import posterior
 from pre_core.crossing.bound import DIFFERENCE, central_jacobian, optimise_subset
 from pre_core.crossing.compliances import to_compliance_coordinates
 from pre_core.crossing.mismatch import expected_levels, mismatch_spectra
+from pre_core.crossing.pavement import known_pavement
 from pre_core.crossing.preparation import build_problem, to_standardised, update_noise
 from pre_core.diagnostics.calibration import truncated_covariance
 from pre_core.physics.vehicle import total_mass_kg
@@ -125,7 +127,14 @@ def _on_its_road(
     level = expected_levels(front, rear, truth.conditions.road_class)
     # The suspension equations have full weight until the nuisances are fitted: their residuals are
     # read off the rows.
-    return update_noise(problem._replace(mismatch=mismatch), y, problem.force, mismatch=level)
+    ratio = truth.paths.pavement.deck_roughness
+    return update_noise(
+        problem._replace(mismatch=mismatch),
+        y,
+        problem.force,
+        mismatch=level,
+        pavement=known_pavement(problem, y, ratio),
+    )
 
 
 def _at_best_nuisances(
@@ -142,7 +151,7 @@ def _at_best_nuisances(
     level = problem.mismatch.level_m3
     # The suspension's residuals are read off the rows: first without the part of the nuisances.
     y = optimise_subset(problem, y, nuisances)
-    problem = update_noise(problem, y, mismatch=level)
+    problem = update_noise(problem, y, mismatch=level, pavement=problem.mismatch.pavement)
     return problem, optimise_subset(problem, y, nuisances)
 
 

@@ -18,7 +18,7 @@ from pre_core.crossing.noise import (
     noise_path,
     noise_spectrum,
 )
-from pre_core.crossing.preparation import MIN_MISMATCH_GAIN
+from pre_core.crossing.off_bridge import MIN_MISMATCH_GAIN
 from pre_core.crossing.rows import RESIDUALS, filter_rows, row_count, row_filter
 from pre_core.crossing.whitening import white_rows, whitener
 from pre_core.physics.models import from_models

@@ -12,11 +12,11 @@ import pytest
 
 from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import posterior
+from pre_core.crossing.off_bridge import off_bridge_residuals
 from pre_core.crossing.posterior import ChainageFixes, Priors
 from pre_core.crossing.preparation import (
     CrossingInputs,
     build_problem,
-    off_bridge_residuals,
     update_noise,
 )
 from pre_core.crossing.rows import RESIDUALS
