@@ -106,6 +106,8 @@ class RoadMismatch(StrictModel):
     n_0_per_m: Annotated[Finite, Field(gt=0)]
     common_share: Annotated[Finite, Field(ge=0, le=1)] | None = None
     """Share of its power common to all runs of a wheel-path group; None for a single run."""
+    bridge_ratio: Annotated[Finite, Field(gt=0)] | None = None
+    """Its amplitude on the bridge over that off it, in waves of 1 m; None in older results."""
 
 
 class RoadResult(StrictModel):

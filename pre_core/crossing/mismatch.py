@@ -212,21 +212,38 @@ def tilt_of(cycles_per_m: FloatArray) -> FloatArray:
     return np.asarray(np.log(np.clip(cycles_per_m, low, high) / _PIVOT_CYCLES_PER_M))
 
 
+def long_wave_power(mismatch: Mismatch) -> float:
+    """Return the expected power on the bridge over that off it, at `LONG_CYCLES_PER_M`."""
+    if mismatch.pavement is None:
+        return 1.0
+    return float(_power_ratio(mismatch.pavement, np.array([LONG_CYCLES_PER_M]))[0])
+
+
+def _power_ratio(pavement: BridgePavement, cycles_per_m: FloatArray) -> FloatArray:
+    """Return the expected power (g,) on the bridge over that off it at wave numbers (g,)."""
+    tilt = tilt_of(cycles_per_m)
+    columns = np.stack([np.ones_like(tilt), tilt], axis=1)
+    variance = np.einsum("gi,ij,gj->g", columns, pavement.covariance, columns)
+    return np.asarray(np.exp(2.0 * (columns @ pavement.ratio_and_tilt + variance)))
+
+
 def on_bridge(mismatch: Mismatch) -> Mismatch:
     """Return the mismatch as it is expected on the bridge, as one shape of level 1."""
     if mismatch.pavement is None:
         return mismatch
-    shapes, pavement = mismatch.shapes, mismatch.pavement
-    tilt = tilt_of(shapes.cycles_per_m)
-    columns = np.stack([np.ones_like(tilt), tilt], axis=1)
-    variance = np.einsum("gi,ij,gj->g", columns, pavement.covariance, columns)
-    factor = np.exp(2.0 * (columns @ pavement.ratio_and_tilt + variance))
+    shapes = mismatch.shapes
+    factor = _power_ratio(mismatch.pavement, shapes.cycles_per_m)
     level = mismatch.level_m3
     changed = shapes._replace(
         density=_windowed(factor * (level @ shapes.density))[None, :],
         front_cross_spectrum_density=factor * (level @ shapes.front_cross_spectrum_density)[None],
     )
     return Mismatch(changed, np.ones(1), mismatch.speed_m_per_s)
+
+
+def pavement_ratio(mismatch: Mismatch) -> float:
+    """Return the estimated amplitude on the bridge over that off it, in waves of a metre."""
+    return 1.0 if mismatch.pavement is None else float(np.exp(mismatch.pavement.ratio_and_tilt[0]))
 
 
 def two_parameter_spectrum(mismatch: Mismatch) -> tuple[float, float]:

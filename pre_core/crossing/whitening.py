@@ -45,7 +45,8 @@ def whitener(
     """Return the factor for `count` filtered residuals; `density` (4,) is one-sided, in m/s²/√Hz.
 
     `force` (2, shapes) is the suspension noise in N²/Hz (`no_force_noise` without any), `road` the
-    mismatch. Raise ValueError where the densities leave some residual without noise.
+    mismatch. Raise ValueError where the densities leave some residual without noise, or if the
+    mismatch on the bridge is that of another number of residuals.
     """
     has_pavement = road is not None and road.pavement is not None
     everywhere = None if has_pavement else road
@@ -67,6 +68,8 @@ def whitener(
     differing, weight = np.zeros((0, lags)), np.zeros((0, count))
     if road is not None and road.pavement is not None:
         differing, weight = _off_and_on_bridge(road, rows, turn)
+        if weight.shape[1] != count:
+            raise ValueError(f"the pavement is that of {weight.shape[1]} residuals, not {count}")
     diagonal = one[:, band].copy()
     for more in _RIDGES:
         one[:, band] = diagonal * (1.0 + more)

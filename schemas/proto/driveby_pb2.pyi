@@ -191,14 +191,16 @@ class Covariance(_message.Message):
     def __init__(self, names: _Optional[_Iterable[str]] = ..., matrix: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class RoadMismatch(_message.Message):
-    __slots__ = ("a_m3", "n_0_per_m", "common_share")
+    __slots__ = ("a_m3", "n_0_per_m", "common_share", "bridge_ratio")
     A_M3_FIELD_NUMBER: _ClassVar[int]
     N_0_PER_M_FIELD_NUMBER: _ClassVar[int]
     COMMON_SHARE_FIELD_NUMBER: _ClassVar[int]
+    BRIDGE_RATIO_FIELD_NUMBER: _ClassVar[int]
     a_m3: float
     n_0_per_m: float
     common_share: float
-    def __init__(self, a_m3: _Optional[float] = ..., n_0_per_m: _Optional[float] = ..., common_share: _Optional[float] = ...) -> None: ...
+    bridge_ratio: float
+    def __init__(self, a_m3: _Optional[float] = ..., n_0_per_m: _Optional[float] = ..., common_share: _Optional[float] = ..., bridge_ratio: _Optional[float] = ...) -> None: ...
 
 class RoadResult(_message.Message):
     __slots__ = ("x_m", "front_m", "rear_m", "mean_m", "std_m", "iri_m_per_km", "iso_class", "mismatch")

@@ -326,6 +326,11 @@ def _level_lines(crossing: CrossingResult) -> Iterator[str]:
         yield (
             f"profile mismatch: {mismatch.A_m3:.2g} m³ at long wavelengths, a quarter of that at "
             f"{mismatch.n_0_per_m:.1f} cycles/m"
+            + (
+                ""
+                if mismatch.bridge_ratio is None
+                else f"; on the bridge × {mismatch.bridge_ratio:.1f}"
+            )
         )
 
 

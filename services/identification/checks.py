@@ -87,6 +87,9 @@ or tracks that differ by 20 cm where they are declared equal."""
 ALIKE_LOADS = 0.1
 """Share of the total load below which a difference between the axle loads counts as none. Equal
 loads make the effect of the road indistinguishable from that of the bridge."""
+_LARGEST_PAVEMENT_RATIO = 6.0
+"""Largest tolerated mismatch on the bridge over that off it, 2.5 standard deviations of its prior:
+decks were up to 3.8 times as rough as the road before them."""
 _UNINFORMED = 0.8
 """Posterior spread of the best-known element, relative to its prior, above which the crossing was
 uninformative."""
@@ -128,6 +131,8 @@ class Fit(NamedTuple):
     led_by_mismatch: float = 0.0
     """Largest correction of a truck's unknown for the mismatch, in multiples of its prior's
     spread."""
+    pavement_ratio: float = 1.0
+    """Amplitude of the mismatch on the bridge over that off it, in waves of a metre."""
 
 
 def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
@@ -138,7 +143,11 @@ def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
         reasons.append(Reason.APPROACH_TOO_SHORT)
     if fit.prior_z and max(abs(z) for z in fit.prior_z.values()) > _LARGEST_VEHICLE_Z:
         reasons.append(Reason.IMPLAUSIBLE_VEHICLE)
-    if fit.mismatch_excess > _MISMATCH_EXCESS or is_misled_by_mismatch(fit):
+    if (
+        fit.mismatch_excess > _MISMATCH_EXCESS
+        or fit.pavement_ratio > _LARGEST_PAVEMENT_RATIO
+        or is_misled_by_mismatch(fit)
+    ):
         reasons.append(Reason.MISMATCH_IMPLAUSIBLE)
     if abs(fit.position_z) > _LARGEST_POSITION_Z:
         reasons.append(Reason.POSITION_INCONSISTENT)

@@ -12,6 +12,7 @@ from pre_core import parameters
 from pre_core.crossing import posterior, shaking, slip, speeds
 from pre_core.crossing.compliances import MISMATCH_BIAS_SPREAD, mismatch_bias
 from pre_core.crossing.fit import Optimum, normal_approximation
+from pre_core.crossing.mismatch import pavement_ratio
 from pre_core.crossing.off_bridge import compared_length_m, mismatch_excess, rear_axle_chainage_m
 from pre_core.crossing.rows import RESIDUALS
 from pre_core.search.loop import Termination
@@ -96,4 +97,5 @@ def _fit(data: CrossingData, found: Optimum) -> Fit:
         slip.largest_step(problem, found.state, covariance),
         mismatch_excess(problem, y) if problem.mismatch.level_m3.any() else 0.0,
         float(np.abs(moved).max()),
+        pavement_ratio(problem.mismatch),
     )

@@ -15,7 +15,7 @@ from pre_core import parameters
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing import optimum, posterior
 from pre_core.crossing.fit import Optimum
-from pre_core.crossing.mismatch import two_parameter_spectrum
+from pre_core.crossing.mismatch import pavement_ratio, two_parameter_spectrum
 from pre_core.crossing.preparation import CrossingInputs, lines_hz
 from pre_core.crossing.sampling import PosteriorDraws, sample
 from pre_core.physics.beam_basis import first_frequencies_hz
@@ -429,7 +429,8 @@ def _road(
     mismatch = None
     if problem.mismatch.level_m3.any():
         level, corner = two_parameter_spectrum(problem.mismatch)
-        mismatch = results.RoadMismatch(A_m3=level, n_0_per_m=corner)
+        ratio = pavement_ratio(problem.mismatch)
+        mismatch = results.RoadMismatch(A_m3=level, n_0_per_m=corner, bridge_ratio=ratio)
     return road.model_copy(update={"std_m": tuple(spread.tolist()), "mismatch": mismatch})
 
 

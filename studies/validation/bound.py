@@ -194,7 +194,8 @@ def bound_of_runs(
     all. The result comes from draws in 1/EI (`pre_core.survey.plan`), with `scale_error`.
     """
     problem, y = truths[0]
-    track = planned_path_group(truths, problem.mismatch, wander_m)
+    whole = problem.mismatch._replace(pavement=None)  # its residuals are those of one run
+    track = planned_path_group(truths, whole, wander_m)
     known = bridge_prior(problem)
     precision = survey_information([track], len(truths), known.log_odds.size)
     where = posterior.layout(problem)

@@ -26,8 +26,8 @@ from tests.unit.identification.test_fusing import ELEMENTS, NOMINAL, crossing
 def test_a_survey_has_one_truck_one_bridge_and_one_road() -> None:
     site = default_site()
     kind = KINDS["twin"]._replace(changes=0.05)
-    of = surveys._site_of(site, kind, 0)
-    one, other = (surveys._truth(of, kind, 3, number, 0) for number in (0, 1))
+    of = surveys.site_of_truck(site, kind, 0)
+    one, other = (surveys.crossing_truth(of, kind, 3, number, 0) for number in (0, 1))
     assert one[0].car == other[0].car
     assert one[0].conditions.road_seed == other[0].conditions.road_seed == 3
     assert one[1] != other[1]
@@ -36,15 +36,15 @@ def test_a_survey_has_one_truck_one_bridge_and_one_road() -> None:
     change = one[0].beam.flexural_rigidity_nm2 / other[0].beam.flexural_rigidity_nm2
     assert 0.0 < np.abs(np.log(change)).max() < 0.4
     assert np.ptp(np.log(change)) == pytest.approx(0.0, abs=1e-12)  # common in every other survey
-    assert surveys._truth(of, kind, 4, 0, 0)[0].car != one[0].car
+    assert surveys.crossing_truth(of, kind, 4, 0, 0)[0].car != one[0].car
 
 
 def test_trucks_take_turns() -> None:
     site = default_site()
-    loaded, empty = (surveys._site_of(site, KINDS["loaded-and-empty"], k) for k in (0, 1))
+    loaded, empty = (surveys.site_of_truck(site, KINDS["loaded-and-empty"], k) for k in (0, 1))
     assert loaded.vehicles[0].total_mass_kg > 3.0 * empty.vehicles[0].total_mass_kg
     assert loaded.vehicles[0].id != empty.vehicles[0].id
-    three = surveys._site_of(site, KINDS["three-elements"], 0)
+    three = surveys.site_of_truck(site, KINDS["three-elements"], 0)
     assert len(three.bridges[0].lengths_m) == 3
 
 
@@ -53,7 +53,7 @@ def test_a_scenario_is_at_a_level_of_its_own_in_every_survey() -> None:
     nominal = np.array(site.bridges[0].nominal_flexural_rigidity_nm2)
     levels = set()
     for survey in range(4):
-        truth, _ = surveys._truth(site, kind, survey, 5, 0)
+        truth, _ = surveys.crossing_truth(site, kind, survey, 5, 0)
         ratio = truth.beam.flexural_rigidity_nm2 / nominal
         assert np.array_equal(
             truth.beam.flexural_rigidity_nm2, surveys._survey_truth(site, kind, survey)
@@ -63,7 +63,7 @@ def test_a_scenario_is_at_a_level_of_its_own_in_every_survey() -> None:
         levels.add(float(ratio[0]))
     assert len(levels) == 4
     # The same truck, bearings and road as with another scenario: only EI differs.
-    other, _ = surveys._truth(site, KINDS["scenario-1"], 3, 5, 0)
+    other, _ = surveys.crossing_truth(site, KINDS["scenario-1"], 3, 5, 0)
     assert other.car == truth.car
     assert other.conditions == truth.conditions
     assert surveys.sites_of(site, kind)[0].sensor.noise_density_ug_per_rthz == (100.0,) * 4
@@ -74,7 +74,7 @@ def test_what_was_driven_before_has_its_truth_still() -> None:
     site = default_site()
     for name, kind in KINDS.items():
         if kind.scenario is None and not kind.elements:
-            of = surveys._site_of(site, kind, 0)
+            of = surveys.site_of_truck(site, kind, 0)
             drawn = draw_truth(of, 3000).beam.flexural_rigidity_nm2
             assert np.array_equal(surveys._survey_truth(of, kind, 3), drawn), name
 
@@ -115,7 +115,7 @@ def test_what_was_driven_is_not_driven_again(
     def one(site: object, kind: str, survey: int, number: int, settings: object) -> Record:
         assert isinstance(settings, IdentificationSettings)
         driven.append((kind, survey, number))
-        of = surveys._site_of(default_site(), KINDS[kind], 0)
+        of = surveys.site_of_truck(default_site(), KINDS[kind], 0)
         return record(kind, survey, number) | {"identity": surveys.identity_of(of, settings)}
 
     monkeypatch.setattr(surveys, "one_crossing", one)

@@ -114,6 +114,12 @@ def test_mismatch_that_no_declared_tyre_causes_is_named(field: str) -> None:
     assert reasons_after_fit(crossing(), odd) == [Reason.MISMATCH_IMPLAUSIBLE]
 
 
+def test_deck_far_rougher_than_any_other_is_named() -> None:
+    assert reasons_after_fit(crossing(), fit(normals(), pavement_ratio=3.8)) == []
+    odd = fit(normals(), pavement_ratio=7.0)
+    assert reasons_after_fit(crossing(), odd) == [Reason.MISMATCH_IMPLAUSIBLE]
+
+
 def test_a_position_that_the_receiver_denies() -> None:
     assert reasons_after_fit(crossing(), fit(normals(), position_z=-5.0)) == [
         Reason.POSITION_INCONSISTENT
