@@ -32,7 +32,7 @@ from pre_core.crossing.compliances import (
 )
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.lines import project_out
-from pre_core.crossing.mismatch import CORRELATION_LENGTH_M, Mismatch
+from pre_core.crossing.mismatch import CORRELATION_LENGTH_M, Mismatch, long_wave_power
 from pre_core.crossing.off_bridge import off_bridge_residuals
 from pre_core.crossing.preparation import replace_mismatch
 from pre_core.crossing.residuals import EvaluationPoints, GriddedCrossing, evaluate
@@ -92,7 +92,7 @@ class CrossingLikelihood(NamedTuple):
     truck: Coordinates
     knots_m: FloatArray
     """Knots (q,) of the long waves of d; empty where both axles follow one profile."""
-    level_m3: FloatArray  # (s,) levels of the mismatch as the crossing estimates them
+    level_m3: FloatArray  # (s,) levels of the mismatch on the bridge as the crossing estimates them
     off_bridge: OffBridgeMismatch | None
     bends: CurvatureTerms | None = None
     """Curvature terms; with them x continues with the longitudinal offset in m and the terms."""
@@ -186,7 +186,7 @@ def likelihood(found: Optimum, *, with_bends: bool = True) -> CrossingLikelihood
         _coordinates(problem, bridge),
         _coordinates(problem, truck),
         grid[inner],
-        found.problem.mismatch.level_m3,
+        found.problem.mismatch.level_m3 * long_wave_power(found.problem.mismatch),
         _off_bridge(found) if differs else None,
         bends,
     )
@@ -354,7 +354,7 @@ def _white_knots(
         column[::RESIDUALS] = filtered
         solve(problem.noise.factor, problem.noise.reciprocal, column)
         out[:, k] = column
-    if problem.lines_hz:
+    if problem.noise.lines.size:
         out = project_out(problem.noise.lines, out.T).T
     return out
 
