@@ -1,12 +1,15 @@
 """The printed line of an alarm."""
 
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 
-from schemas.alarms import Alarm
 from services.common.errors import one_line
 
+if TYPE_CHECKING:
+    from schemas.alarms import Alarm
 
-def alarm_line(alarm: Alarm) -> str:
+
+def alarm_line(alarm: "Alarm") -> str:
     """Return the printed line of an alarm."""
     note = alarm.acknowledged
     state = "stands" if note is None else f"acknowledged by {note.by} on {day(note.time)}"
