@@ -26,7 +26,7 @@ _LONGEST_QUEUE: Final = 200_000
 ArrivalsQueue = queue.Queue[TruckMessage | LivenessToken]
 
 
-class Receiver:
+class MessageReceiver:
     """The thread that receives, and the queue of what it has received and checked."""
 
     def __init__(self, bus: zenoh.Session, realm: str, at_end: Callable[[], None]) -> None:

@@ -43,7 +43,7 @@ from services.ledger.runs import (
 )
 from services.worker.backfill import MARGIN_S, Backfill
 from services.worker.loop import Loop, SiteReload
-from services.worker.receiving import Receiver
+from services.worker.receiving import MessageReceiver
 from services.worker.recording_list import BackfillSource
 from services.worker.service import Search, WorkerService, publish_progress
 from services.worker.settings import WorkerSettings
@@ -95,7 +95,7 @@ def run(asked: WorkerSettings, ready: Callable[[], None] | None = None) -> int:
         if backfill is not None:
             stack.callback(backfill.close)
         execution.wait_until_warm()
-        receiver = Receiver(bus, asked.realm, stop.set)
+        receiver = MessageReceiver(bus, asked.realm, stop.set)
         try:
             service.resume(earlier)
             del earlier  # it covers two days

@@ -66,7 +66,7 @@ def test_unit_starts_its_command(name: str) -> None:
     assert more is not None
     for given in (arguments, [*arguments, *shlex.split(more[1])]):
         options = cli._parser().parse_args(given)
-        assert options.handler in cli.SERVICES
+        assert options.handler in cli._SERVICES
         assert options.folder == Path("recordings")
         assert options.site == Path("/etc/driveby/site.toml")
     assert service["EnvironmentFile"] == f"-/etc/driveby/{name}.env"

@@ -35,7 +35,7 @@ _HOW = (
 
 @dataclass(frozen=True, kw_only=True)
 class AlarmOptions:
-    """What is done with alarms, and how changes are detected."""
+    """Options of `driveby alarm`: the action, and how changes are detected."""
 
     what: str = positional("check | list | ack BRIDGE | serve", choices=_WHAT)
     bridge: str | None = positional("bridge whose alarm is acknowledged", nargs="?")

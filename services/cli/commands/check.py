@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckOptions:
-    """What is checked before a survey."""
+    """Options of `driveby check`: what to check before a survey."""
 
     paths: tuple[Path, ...] = positional(
         "a site file (default: the recordings' own), and recordings or folders of CSV "

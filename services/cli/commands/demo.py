@@ -11,7 +11,7 @@ from services.common.options import flag, noise_option, output_folder_option, sp
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions:
-    """How the demonstration runs, and where to it writes."""
+    """Options of `driveby demo`: how it runs, and the folder that it writes."""
 
     out: Path | None = output_folder_option("new folder for the outputs")
     speed: float = speed_option(4.0)

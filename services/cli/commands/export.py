@@ -36,7 +36,7 @@ class ExportOptions:
 
 
 class _Found(NamedTuple):
-    """What is exported."""
+    """Options of `driveby export`."""
 
     site: "Site | None"
     results: "Results | None"

@@ -283,9 +283,9 @@ def test_a_receiver_that_fails_in_any_way_is_not_taken_for_a_quiet_one(
     def take_all(*_: object) -> None:
         raise RuntimeError("unforeseen")
 
-    monkeypatch.setattr(receiving.Receiver, "_receive_all", take_all)
+    monkeypatch.setattr(receiving.MessageReceiver, "_receive_all", take_all)
     has_ended = threading.Event()
-    receiver = receiving.Receiver(cast("zenoh.Session", None), REALM, has_ended.set)
+    receiver = receiving.MessageReceiver(cast("zenoh.Session", None), REALM, has_ended.set)
     receiver.start()
     assert has_ended.wait(LONGEST_S)
     receiver.close()
