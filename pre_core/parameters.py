@@ -121,8 +121,10 @@ SCALARS: Final = (
 ELEMENT: Final = ParameterSpec("EI", "N·m²", BRIDGE, "flexural_rigidity_nm2", 0, 1)
 """The row of every element; in results its name is EI_1, EI_2, …"""
 PAIRS: Final = ("unsprung_mass_kg", "tyre_stiffness_n_per_m", "tyre_damping_ns_per_m")
-"""Keys of the rows that belong to the two compared axles. Springs and dampers are of the front axle
-and of the axles behind it together."""
+"""Keys of the rows that always belong to the two compared axles."""
+SPRINGS: Final = ("suspension_stiffness_n_per_m", "suspension_damping_ns_per_m")
+"""Keys of springs and dampers. Those of an equalised tandem are not estimated, and the values are
+of the front axle and of the axles behind it together."""
 DERIVED_UNITS: Final = {"m_s": "kg", "m_s1": "kg", "m_s2": "kg"}
 
 
@@ -158,10 +160,12 @@ def table(elements: int, first_axle: int = 1) -> tuple[ParameterSpec, ...]:
     """Return the rows of theta for a bridge of `elements` elements.
 
     `first_axle` is the number of the first of the two axles whose profiles are compared: 2 for a
-    truck with a tandem, whose rows of axles and tyres are then those of axles 2 and 3.
+    truck with a tandem, whose rows of springs, axles and tyres are then those of axles 2 and 3.
     """
     scalars = (
-        row._replace(name=f"{row.name[:-1]}{row.which + first_axle}") if row.key in PAIRS else row
+        row._replace(name=f"{row.name[:-1]}{row.which + first_axle}")
+        if row.key in (*PAIRS, *SPRINGS)
+        else row
         for row in SCALARS
     )
     rigidities = (ELEMENT._replace(name=f"EI_{e + 1}", which=e) for e in range(elements))

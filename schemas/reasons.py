@@ -42,6 +42,7 @@ class Reason(StrEnum):
     NOISE_ABOVE_DECLARED = "noise_above_declared"
     NOISE_BELOW_DECLARED = "noise_below_declared"
     IMPLAUSIBLE_VEHICLE = "implausible_vehicle"
+    TANDEM_FRICTION = "tandem_friction"
     MORE_AXLES_THAN_DECLARED = "more_axles_than_declared"
     MISMATCH_IMPLAUSIBLE = "mismatch_implausible"
     COMMON_DISTURBANCE = "common_disturbance"
@@ -105,6 +106,10 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
         "The accelerometers are much quieter than the site file says, which could hide a misfit."
     ),
     Reason.IMPLAUSIBLE_VEHICLE: "The estimated truck parameters contradict the site file.",
+    Reason.TANDEM_FRICTION: (
+        "Friction in the springs of the tandem, whose axles do not share their load, hides the "
+        "difference of the deflections under them."
+    ),
     Reason.MORE_AXLES_THAN_DECLARED: (
         "The rear of the truck moves as if pushed by a further axle or a trailer that the site "
         "file does not declare."

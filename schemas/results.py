@@ -325,6 +325,14 @@ def is_torsion_declared(crossing: CrossingResult) -> bool:
     return prior is not None and prior.distribution == "log_normal"
 
 
+def first_compared_axle(crossing: CrossingResult) -> int:
+    """Return the number of the first of the two axles whose profiles were compared.
+
+    It is 2 for a truck with a tandem, which alone has a share of the load.
+    """
+    return 2 if "share" in (crossing.parameters or {}) else 1
+
+
 def unresolved_note(crossing: CrossingResult) -> str | None:
     """Return which elements a crossing could not resolve, in words; None if it resolved all."""
     if crossing.parameters is None or crossing.derived is None or crossing.derived.ei_level is None:

@@ -167,7 +167,7 @@ _CHOICES: Final = {
 
 
 _TABLE_LISTS: Final = {
-    "axles": "two [[vehicle.axles]], or three of which the last two are an equalised bogie",
+    "axles": "two [[vehicle.axles]], or three: a front axle and a tandem",
     "bogies.axles": "a list of the numbers of its axles, [2, 3]",
     "bogies": "one [[vehicle.bogies]], with axles = [2, 3]",
     "sensors": "at most 32 [[vehicle.sensors]]",

@@ -1,8 +1,9 @@
-"""Load-equalised tandems of a site file: the axles of `[[vehicle.axles]]` that are compared.
+"""Tandems of a site file: the axles of `[[vehicle.axles]]` that are compared.
 
-Behind a front axle, two axles that share one spring force feel nearly the same road and need no
-spring to be believed. A tandem on springs of its own is refused: friction of a few per cent of the
-load hides the difference of the deflections under its axles.
+Behind a front axle, two axles that share one spring force feel nearly the same road, and no spring
+is needed to know their forces. Of a tandem whose axles have springs of their own, the law of the
+springs gives the difference of the forces: friction of a few per cent of the load then hides the
+difference of the deflections.
 """
 
 import math
@@ -20,14 +21,16 @@ _LARGEST_UNEVENNESS: Final = 0.8
 
 
 class Tandem(NamedTuple):
-    """A truck's front axle and the two equalised ones behind it."""
+    """A truck's front axle and the two axles behind it."""
 
     lead: Axle
     first: Axle
     second: Axle
     share: float
-    """Share of the spring force on the first axle of the tandem."""
+    """Share of the spring force, or of the static one, on the first axle of the tandem."""
     share_spread: float
+    is_equalised: bool = True
+    """Whether both axles share one spring force; else each has springs of its own."""
 
     @property
     def axles(self) -> tuple[Axle, Axle]:
@@ -49,23 +52,19 @@ def tandem_of(axles: Sequence[Axle], bogies: Sequence[Bogie]) -> Tandem:
     """Return the tandem of a truck with more than two axles; raise a FieldError without one."""
     if len(axles) != AXLES:
         raise error_at(
-            "axles",
-            f"has {len(axles)} axles, it must be two, or three of which the last two share their "
-            "load by an equalised bogie",
+            "axles", f"has {len(axles)} axles, it must be two, or a front axle and two behind it"
         )
-    if len(bogies) != 1 or sorted(bogies[0].axles) != [_FIRST, _FIRST + 1]:
-        raise error_at(
-            "bogies",
-            "does not join axles 2 and 3, they must share their load by an equalised bogie: "
-            "friction in springs of their own hides what the bridge does",
-        )
+    if len(bogies) > 1 or (bogies and sorted(bogies[0].axles) != [_FIRST, _FIRST + 1]):
+        raise error_at("bogies", "does not join axles 2 and 3, it must be one bogie of these")
+    lead, first, second = axles
+    if not bogies or not bogies[0].equalised:
+        if bogies and bogies[0].shares is not None:
+            raise error_at(
+                "bogies.0.shares",
+                "are of axles that share their load, remove them or set equalised = true",
+            )
+        return Tandem(lead, first, second, *_static_share(first, second), is_equalised=False)
     bogie = bogies[0]
-    if not bogie.equalised:
-        raise error_at(
-            "bogies.0.equalised",
-            "is false, it must be true: friction in springs that do not share their load hides "
-            "what the bridge does",
-        )
     shares = bogie.shares or (1.0, 1.0)
     of_axle = dict(zip(bogie.axles, shares, strict=True))
     share = of_axle[_FIRST] / math.fsum(shares)
@@ -75,8 +74,37 @@ def tandem_of(axles: Sequence[Axle], bogies: Sequence[Bogie]) -> Tandem:
             f"give one axle {max(share, 1.0 - share):.0%} of the force, it must be at most "
             f"{_LARGEST_UNEVENNESS:.0%}",
         )
-    lead, first, second = axles
     return Tandem(lead, first, second, share, bogie.share_spread)
+
+
+def _static_share(first: Axle, second: Axle) -> tuple[float, float]:
+    """Return the share of the load on the springs of the first axle, and its relative spread."""
+    carried = []
+    for number, axle in ((_FIRST, first), (_FIRST + 1, second)):
+        if axle.load_kg is None:
+            raise error_at(
+                f"axles.{number - 1}.load_kg",
+                "is missing, it must be a mass in kg: axles that do not share their load by an "
+                "equalised bogie are weighed",
+            )
+        carried.append(axle.load_kg - axle.unsprung_mass_kg)
+        if carried[-1] <= 0.0:
+            raise error_at(
+                f"axles.{number - 1}.unsprung_mass_kg",
+                f"is {axle.unsprung_mass_kg:g}, it must be a mass less than the load of the axle",
+            )
+    share = carried[0] / math.fsum(carried)
+    if max(share, 1.0 - share) > _LARGEST_UNEVENNESS:
+        raise error_at(
+            "axles.1.load_kg",
+            f"and the load of axle 3 give one axle {max(share, 1.0 - share):.0%} of the load of "
+            f"both, it must be at most {_LARGEST_UNEVENNESS:.0%}",
+        )
+    errors = [
+        (axle.load_kg or 0.0) * axle.load_kg_spread / one
+        for axle, one in zip((first, second), carried, strict=True)
+    ]
+    return share, (1.0 - share) * math.hypot(*errors)
 
 
 def joined(tandem: Tandem) -> Axle:

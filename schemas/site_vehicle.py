@@ -108,7 +108,7 @@ class Vehicle(WithSpreads):
 
     @property
     def tandem(self) -> Tandem | None:
-        """The equalised tandem behind the front axle."""
+        """The tandem behind the front axle."""
         return tandem_of(self.axles, self.bogies) if self.axles else None
 
     @property

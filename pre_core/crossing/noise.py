@@ -32,6 +32,12 @@ from numpy.typing import NDArray
 from pre_core.crossing import mismatch as _mismatch
 from pre_core.crossing.mismatch import Mismatch
 from pre_core.crossing.rows import RESIDUALS, RowFilter, phases
+from pre_core.crossing.suspension_noise import (
+    FORCE_SHAPES,
+    REDUCED_WEIGHT_FACTOR,
+    REDUCED_WEIGHT_SPRING_N_PER_M,
+    force_shapes,
+)
 from pre_core.crossing.whittle import maximum_likelihood_levels
 from pre_core.parameters import C_S1, C_U1, D_1, K_S1, K_U1, KAPPA, M_U1, SHARE
 from pre_core.physics import tandem
@@ -40,23 +46,12 @@ from pre_core.physics.vehicle import masses_above_axles
 
 FloatArray = NDArray[np.float64]
 
-REDUCED_WEIGHT_SPRING_N_PER_M = 4e5
-"""Divisor of body equations with reduced suspension weight. Divided by the estimated stiffness, the
-suspension noise would decrease with it: a bias that can be corrected only as well as its level is
-known. (Friction of 2 to 10 %: EI 0.4 standard deviations too low.) With full weight the divisor is
-the stiffness: the sensor noise is known."""
 _SOURCES = 6  # s1, s2, u1, u2; and the other body sensor at the front's and at the rear's moment
 _FEW_FREQUENCIES = 48
 """Midpoints of even intervals up to half the residuals' rate, for a trace that is computed
 repeatedly."""
 _MANY_FREQUENCIES = 512
 """Number of frequencies that resolves the phase between the axles."""
-_FORCE_CENTRES_HZ = np.arange(0.0, 60.0, 4.0)
-FORCE_SHAPES = _FORCE_CENTRES_HZ.size
-"""Number of bumps, a few hertz wide, in the spectrum of the suspension noise: that of dry friction
-falls by six decades from the body's bounce to the residuals' highest frequency."""
-FORCE_MEMORY_S = 0.3
-"""End of the suspension noise's covariance, which gives the bumps their width."""
 _MIDDLE_BAND, _TOP_BAND = (0.22, 0.54), (0.65, 0.757)
 """Bands relative to half the residuals' rate: 12 to 30 and 36 to 42 Hz for sensors of 250 Hz and
 more."""
@@ -91,6 +86,8 @@ class NoisePath(NamedTuple):
     total_mass_kg: float = 0.0
     gap_m: float = 0.0
     """Distance between the axles of the tandem."""
+    lag_s: float = 0.0
+    """Time of the truck over that distance."""
 
 
 def noise_path(
@@ -99,10 +96,15 @@ def noise_path(
     wheelbase_m: float,
     is_inertial: bool,
     lead: Lead = NO_LEAD,
+    speed_m_per_s: float = 0.0,
 ) -> NoisePath:
-    """Return the noise path of theta (p,); `wheelbase_m` is between the compared axles."""
+    """Return the noise path of theta (p,); `wheelbase_m` is between the compared axles.
+
+    The speed matters to a tandem whose axles have springs of their own.
+    """
     if lead.ahead_m > 0.0:
-        return NoisePath(theta, 0.0, 0.0, 0.0, True, lead, total_mass_kg, wheelbase_m)
+        lag_s = wheelbase_m / speed_m_per_s if speed_m_per_s > 0.0 else 0.0
+        return NoisePath(theta, 0.0, 0.0, 0.0, True, lead, total_mass_kg, wheelbase_m, lag_s)
     m_s = total_mass_kg - theta[M_U1] - theta[M_U1 + 1]
     masses = masses_above_axles(m_s, theta[D_1], wheelbase_m, theta[KAPPA])
     return NoisePath(theta, *masses, is_inertial)
@@ -122,24 +124,6 @@ def no_force_noise() -> FloatArray:
     return np.zeros((2, FORCE_SHAPES))
 
 
-def _force_shapes(omega: FloatArray) -> FloatArray:
-    """Return spectra (shapes, f) of B(t) cos(omega_k t), B the Bohman window, a half at their tops.
-
-    B is the half wave cos(pi t/T) convolved with itself, so that its spectrum is a square.
-    """
-    centre = 2.0 * np.pi * _FORCE_CENTRES_HZ[:, None]
-    return _bohman(omega - centre) + _bohman(omega + centre)
-
-
-def _bohman(omega: FloatArray) -> FloatArray:
-    """Return the spectrum of the Bohman window ending at +-`FORCE_MEMORY_S`, a half at zero."""
-    turn = omega * FORCE_MEMORY_S
-    apart = 1.0 - (turn / np.pi) ** 2
-    near = np.abs(apart) < 1e-6
-    wave = np.where(near, 0.25 * np.pi, np.cos(0.5 * turn) / np.where(near, 1.0, apart))
-    return np.asarray(0.5 * wave**2)
-
-
 def _estimation(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex128]:
     """Return the truck's equations as factors of its accelerations: (4, 4, f).
 
@@ -148,7 +132,11 @@ def _estimation(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex128]:
     s = 1j * omega
     theta = truck.theta
     if truck.lead.ahead_m > 0.0:
-        return tandem.profile_equations(truck.lead, theta, truck.total_mass_kg, truck.gap_m, omega)
+        of_tandem = tandem.profile_equations(
+            truck.lead, theta, truck.total_mass_kg, truck.gap_m, omega
+        )
+        of_tandem[3] /= REDUCED_WEIGHT_SPRING_N_PER_M
+        return of_tandem
     out = np.zeros((4, 4, omega.size), dtype=np.complex128)
     for w, m_ii in enumerate((truck.m_11, truck.m_22)):
         c, k = theta[C_S1 + w], theta[K_S1 + w]
@@ -170,6 +158,8 @@ def _estimation(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex128]:
 def _responses(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex128]:
     """Return the response (3, 6, f) from the noise of six sources to displacement residuals."""
     estimation = _estimation(truck, omega)
+    if not truck.lead.is_equalised:
+        return tandem.sensor_responses(estimation)
     out = np.zeros((RESIDUALS, _SOURCES, omega.size), dtype=np.complex128)
     for w, sign in ((0, 1.0), (1, -1.0)):
         # The other axle's body sensor enters at another time: sources 4 and 5.
@@ -196,14 +186,25 @@ def noise_spectrum(
 ) -> NDArray[np.complex128]:
     """Return one-sided spectra of the residuals' noise as accelerations: (3, 3, f).
 
-    `force` (2, shapes) in N²/Hz is the nonlinear force of springs and dampers, `road` the mismatch.
+    `force` (2, shapes) in N²/Hz is the nonlinear force of springs and dampers, of which body
+    equations have `REDUCED_WEIGHT_FACTOR` times the power; `road` is the mismatch.
     """
     responses = _responses(truck, omega)
-    sources = np.concatenate([density, density[[1, 0]]])
+    sources = np.concatenate([density, density[[1, 0, 3, 2]]])[: responses.shape[1]]
     weighted = responses * (sources**2)[None, :, None]
     spectrum = np.asarray(np.einsum("icf,jcf->ijf", weighted, responses.conj()))
     if truck.lead.ahead_m > 0.0:  # residuals that are zero, of any noise of their own
-        spectrum[[1, 2], [1, 2]] += float(density @ density)
+        zero = [1, 2] if truck.lead.is_equalised else [1]
+        spectrum[zero, zero] += float(density @ density)
+    if truck.lead.ahead_m > 0.0 and force.any():
+        over = body_divisors(truck)[1]
+        friction = (force[1] @ force_shapes(omega)) * omega**4
+        spectrum[2, 2] += friction / over**2
+        spectrum[0, 0] += (
+            friction
+            / REDUCED_WEIGHT_FACTOR
+            * tandem.friction_passage(truck.lead, truck.theta, truck.gap_m, truck.lag_s, omega)
+        )
     elif force.any():
         spectrum[[1, 2], [1, 2]] += _force_noise_spectra(truck, force, omega)
     if road is not None:
@@ -221,7 +222,7 @@ def _body_spectra(
 def _force_noise_spectra(truck: NoisePath, force: FloatArray, omega: FloatArray) -> FloatArray:
     """Return the contribution of suspension noise to the spectra of the body equations: (2, f)."""
     over = body_divisors(truck)[:, None]
-    return np.asarray((force @ _force_shapes(omega)) * omega**4 / over**2)
+    return np.asarray((force @ force_shapes(omega)) * omega**4 / over**2)
 
 
 class _AliasedBands(NamedTuple):
@@ -412,7 +413,7 @@ def _body_periodogram(
     for at in (omega, 4.0 * np.pi * (0.5 / apart) - omega):  # frequencies above half the rate alias
         power = np.interp(at, rows.omega, rows.power) / interval
         sensors += _body_spectra(truck, density, no_force_noise(), at) * power
-        shapes += _force_shapes(at) * at**4 * power
+        shapes += force_shapes(at) * at**4 * power
     return omega, shown, sensors, shapes
 
 
@@ -444,4 +445,5 @@ def suspension_weight(
     """
     low = rows.omega[rows.omega < 2.0 * np.pi * _SUSPENSION_BAND_HZ]
     sensors = _body_spectra(truck, density, no_force_noise(), low)
-    return float((sensors / _body_spectra(truck, density, force, low)).mean())
+    weight = sensors / _body_spectra(truck, density, force, low)
+    return float(weight[1 if truck.lead.ahead_m > 0.0 else 0 :].mean())

@@ -127,7 +127,9 @@ def _run_strategies(
     problem: PosteriorProblem, y: FloatArray, report: Report, max_evaluations: int
 ) -> list[Optimum]:
     """Return what the ways led to, up to the first that is final or shows a line."""
-    simplest = _WITH_MISMATCH[0] if has_tandem(problem) else _SIMPLEST
+    simplest = _SIMPLEST
+    if has_tandem(problem):
+        simplest = _WITH_MISMATCH[0 if problem.crossing.lead.is_equalised else 1]
     found = [_refine_candidates(problem, y, simplest, report, max_evaluations)]
     if not _has_ended(found[0]):
         found += _try_other_strategies(problem, y, found[0], report, max_evaluations)

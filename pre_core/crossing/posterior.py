@@ -253,14 +253,19 @@ def noise_path_at(problem: PosteriorProblem, y: FloatArray) -> tuple[NoisePath, 
     crossing = problem.crossing
     wheelbase = float(at.wheelbase_m[0])
     truck = noise_path(
-        at.theta[0], crossing.total_mass_kg, wheelbase, crossing.is_inertial, crossing.lead
+        at.theta[0],
+        crossing.total_mass_kg,
+        wheelbase,
+        crossing.is_inertial,
+        crossing.lead,
+        problem.mismatch.speed_m_per_s,
     )
     return truck, problem.density * (1.0 + at.gain[0])
 
 
 def suspension_weight(problem: PosteriorProblem, y: FloatArray) -> float:
-    """Return the suspension weight, 0 to 1, of the truck at y (size,); 0 with a tandem."""
-    if has_tandem(problem):
+    """Return the suspension weight, 0 to 1, of the truck at y (size,); 0 if equalised."""
+    if has_tandem(problem) and problem.crossing.lead.is_equalised:
         return 0.0
     return _noise.suspension_weight(problem.rows, *noise_path_at(problem, y), problem.force)
 

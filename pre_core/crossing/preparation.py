@@ -41,6 +41,7 @@ from pre_core.crossing.residuals import (
 )
 from pre_core.crossing.rows import RESIDUALS, row_count, row_filter
 from pre_core.crossing.step_tables import sinc_table, step_table
+from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_FACTOR
 from pre_core.crossing.tandem import lead_motion
 from pre_core.crossing.whitening import Whitener, solve, whitener
 from pre_core.parameters import FIRST_OF_BRIDGE, TORSION
@@ -58,11 +59,6 @@ _SWING_BEFORE_S = 0.1
 """Time before the truck's entry at which the initial vibration is defined, a margin for the search.
 """
 _MARGIN_M = 3.0  # of road before the first residual, a margin for the trajectory
-_REDUCED_WEIGHT_FACTOR = 100.0
-"""Factor of the suspension noise where its weight is reduced. It is not noise: it follows the
-truck's motion, and could pass for a heavier end or another centre of gravity. Without the factor EI
-was 0.34 standard deviations too low (the median of 36 crossings with friction) and the coverage 93
-%; with it 0.09 and 97 %, with intervals of the same width."""
 
 
 class CrossingInputs(NamedTuple):
@@ -147,15 +143,15 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
     crossing = crossing._replace(swing_sample=swing_sample(crossing, front))
     row = row_filter(model.step_s)
     theta = inputs.priors.theta
+    speed = float(np.ptp(front)) / ((n - 1) * model.step_s)
     noise = whitener(
         row,
         row_count(row, crossing.rows),
-        noise_path(theta, crossing.total_mass_kg, wheelbase, False, crossing.lead),
+        noise_path(theta, crossing.total_mass_kg, wheelbase, False, crossing.lead, speed),
         inputs.density_m_per_s2_per_rthz,
         no_force_noise(),
     )
     shapes = mismatch_spectra(*inputs.footprints)
-    speed = float(np.ptp(front)) / ((n - 1) * model.step_s)
     problem = PosteriorProblem(
         crossing,
         inputs.priors,
@@ -202,7 +198,7 @@ def update_noise(
     where = layout(problem)
     unknowns = where.gains.stop
     if has_tandem(problem):
-        force = no_force_noise()
+        force = no_force_noise() if problem.crossing.lead.is_equalised else force
         problem = _with_lead_motion(problem, y)
     if force is None:
         body = filtered_rows(problem, y)[1:]
@@ -219,7 +215,7 @@ def update_noise(
     at, trucks = _displaced_points(problem, y, unknowns, is_inertial=is_inertial)
     density = problem.density * (1.0 + at.gain)
     count = row_count(problem.rows, problem.crossing.rows)
-    residual_force = _REDUCED_WEIGHT_FACTOR * force
+    residual_force = REDUCED_WEIGHT_FACTOR * force
     profile_noise = road if differs else None
     noise = whitener(problem.rows, count, trucks[0], density[0], residual_force, profile_noise)
     noise = _without_lines(problem, noise)
@@ -261,6 +257,10 @@ def _with_lead_motion(problem: PosteriorProblem, y: FloatArray) -> PosteriorProb
     )
     on = shared_load(crossing.lead, at.theta[0], crossing.total_mass_kg, float(at.wheelbase_m[0]))
     force = on.lead_1 * crossing.signals[0, A] + on.lead_2 * crossing.signals[1, A]
+    if not crossing.lead.is_equalised:
+        own = crossing.lead.unsprung_mass_kg * crossing.lead_acceleration
+        static = (on.lead_kg + crossing.lead.unsprung_mass_kg) * crossing.gravity_m_per_s2
+        force = -work.load[2] - own - static / float(at.common_gain[0])
     motion = lead_motion(crossing.lead, crossing.step_s, profile + work.under_lead, force)
     return problem._replace(crossing=crossing._replace(lead_acceleration=motion))
 
@@ -275,7 +275,7 @@ def replace_mismatch(
         row_count(problem.rows, problem.crossing.rows),
         truck,
         density,
-        _REDUCED_WEIGHT_FACTOR * problem.force,
+        REDUCED_WEIGHT_FACTOR * problem.force,
         mismatch,
     )
     noise = _without_lines(problem, noise)
@@ -340,8 +340,9 @@ def _displaced_points(
     near[np.arange(1, 1 + count), np.arange(count)] += _SLOPE_STEP
     at = points(problem, near)
     total, lead = problem.crossing.total_mass_kg, problem.crossing.lead
+    speed = problem.mismatch.speed_m_per_s
     return at, [
-        noise_path(theta, total, float(wheelbase), is_inertial, lead)
+        noise_path(theta, total, float(wheelbase), is_inertial, lead, speed)
         for theta, wheelbase in zip(at.theta, at.wheelbase_m, strict=True)
     ]
 
@@ -365,7 +366,7 @@ def mismatch_gradient(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
             at.gain,
             at.delay_s,
             problem.density * (1.0 + at.gain[0]),
-            _REDUCED_WEIGHT_FACTOR * problem.force,
+            REDUCED_WEIGHT_FACTOR * problem.force,
             part,
             float(at.wheelbase_m[0]),
             changing,

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_SPRING_N_PER_M
 from pre_core.kernels.lanes import Lanes, fma, fma_scalar, kernel, load, mul, store
-from pre_core.parameters import C_U1, K_U1, M_U1, SHARE
-from pre_core.physics.tandem import Lead, lead_response, shared_load
+from pre_core.parameters import C_S1, C_U1, K_S1, K_U1, M_U1, SHARE
+from pre_core.physics.tandem import Lead, lead_response, own_springs, shared_load
 
 if TYPE_CHECKING:
     from pre_core.crossing.residuals import Buffers, GriddedCrossing
@@ -76,33 +77,36 @@ def wheels(
 ) -> None:
     """Compute minus the profile (`road`) and `load` of the tandem, and the front axle's `load`.
 
-    For theta (p,) and accelerations `speeding` (n,) of the truck. `body` is zero: no equation has
-    the bogie's springs, and the front spring's lower end is not measured. `gravity` is over the
-    common gain.
+    For theta (p,) and accelerations `speeding` (n,) of the truck. `body` is zero, except the second
+    one of a tandem with springs of its own: what they leave of the body's moment about the front
+    axle, over its lever. The front spring's lower end is not measured. `gravity` is over the common
+    gain.
     """
     lead = crossing.lead
     on = shared_load(lead, theta, crossing.total_mass_kg, gap)
-    transfer = crossing.total_mass_kg * crossing.cg_height_m / on.lever_m * gravity
     weight = gravity * crossing.gravity_m_per_s2
-    front, rear = work.corrected[0, 2], work.corrected[1, 2]
-    n = front.size
-    of_lead = work.load[2]
-    own = crossing.lead_acceleration
+    transfer = crossing.total_mass_kg * crossing.cg_height_m / on.lever_m * gravity
+    work.body[0, :] = 0.0
+    work.body[1, :] = 0.0
+    if lead.is_equalised:
+        _shared_force(crossing, work, theta, gap, transfer, speeding)
+    else:
+        _own_forces(crossing, work, theta, gap, transfer, speeding)
+    n = speeding.size
+    of_lead, own = work.load[2], crossing.lead_acceleration
     static = weight * (on.lead_kg + lead.unsprung_mass_kg)
     for i in range(n):
-        inertial = on.lead_1 * front[i] + on.lead_2 * rear[i] - transfer * speeding[i]
-        of_lead[i] = -static - inertial - lead.unsprung_mass_kg * own[i]
+        of_lead[i] -= static + lead.unsprung_mass_kg * own[i]
     for w in range(2):
         share = theta[SHARE] if w == 0 else 1.0 - theta[SHARE]
         m_u, k_u = theta[M_U1 + w], theta[K_U1 + w]
         tau = theta[C_U1 + w] / k_u
         z_u, a_u = work.corrected[2 + w, 0], work.corrected[2 + w, 2]
         static = weight * (share * on.bogie_kg + m_u)
-        road, of_wheel, force, body = work.road[w], work.load[w], work.sharp[w], work.body[w]
+        road, of_wheel, force = work.road[w], work.load[w], work.sharp[w]
         soft = 1.0 / k_u
         for i in range(n):
-            bogie = on.bogie_1 * front[i] + on.bogie_2 * rear[i] + transfer * speeding[i]
-            force[i] = share * bogie + m_u * a_u[i]
+            force[i] += m_u * a_u[i]
         for i in range(n):
             of_wheel[i] = -static - force[i]
         for i in range(n):
@@ -110,7 +114,75 @@ def wheels(
         if tau != 0.0:
             slope = tau / (12.0 * crossing.step_s)
             add_tyre_damping(force, slope, (tau / crossing.step_s) ** 2, soft, road)
-        body[:] = 0.0
+
+
+@kernel
+def _shared_force(
+    crossing: "GriddedCrossing",
+    work: "Buffers",
+    theta: FloatArray,
+    gap: float,
+    transfer: float,
+    speeding: FloatArray,
+) -> None:
+    """Compute the equalised spring force in shares to `sharp`, minus the front one to `load`."""
+    on = shared_load(crossing.lead, theta, crossing.total_mass_kg, gap)
+    a_1, a_2 = work.corrected[0, 2], work.corrected[1, 2]
+    of_lead, first, second = work.load[2], work.sharp[0], work.sharp[1]
+    share = theta[SHARE]
+    rest = 1.0 - share
+    for i in range(speeding.size):
+        of_lead[i] = transfer * speeding[i] - on.lead_1 * a_1[i] - on.lead_2 * a_2[i]
+    for i in range(speeding.size):
+        bogie = on.bogie_1 * a_1[i] + on.bogie_2 * a_2[i] + transfer * speeding[i]
+        first[i] = share * bogie
+        second[i] = rest * bogie
+
+
+@kernel
+def _own_forces(
+    crossing: "GriddedCrossing",
+    work: "Buffers",
+    theta: FloatArray,
+    gap: float,
+    transfer: float,
+    speeding: FloatArray,
+) -> None:
+    """Compute the forces of springs of their own to `sharp`, minus the front one to `load`."""
+    on = shared_load(crossing.lead, theta, crossing.total_mass_kg, gap)
+    own = own_springs(crossing.lead, gap)
+    at_1 = own.lever_1_m / crossing.lead.readings_apart_m
+    at_2 = own.lever_2_m / crossing.lead.readings_apart_m
+    a_1, a_2 = work.corrected[0, 2], work.corrected[1, 2]
+    z_1, z_2, v_1, v_2 = (
+        work.corrected[0, 0],
+        work.corrected[1, 0],
+        work.corrected[0, 1],
+        work.corrected[1, 1],
+    )
+    z_3, z_4, v_3, v_4 = (
+        work.corrected[2, 0],
+        work.corrected[3, 0],
+        work.corrected[2, 1],
+        work.corrected[3, 1],
+    )
+    of_lead, first, second, left = work.load[2], work.sharp[0], work.sharp[1], work.body[1]
+    k_1, k_2, c_1, c_2 = theta[K_S1], theta[K_S1 + 1], theta[C_S1], theta[C_S1 + 1]
+    for i in range(speeding.size):
+        first[i] = k_1 * (z_3[i] - z_1[i] - at_1 * (z_2[i] - z_1[i]))
+        first[i] += c_1 * (v_3[i] - v_1[i] - at_1 * (v_2[i] - v_1[i]))
+    for i in range(speeding.size):
+        second[i] = k_2 * (z_4[i] - z_1[i] - at_2 * (z_2[i] - z_1[i]))
+        second[i] += c_2 * (v_4[i] - v_1[i] - at_2 * (v_2[i] - v_1[i]))
+    hard = 1.0 / (on.lever_m * REDUCED_WEIGHT_SPRING_N_PER_M)
+    whole_1, whole_2 = on.lead_1 + on.bogie_1, on.lead_2 + on.bogie_2
+    for i in range(speeding.size):
+        bogie = on.bogie_1 * a_1[i] + on.bogie_2 * a_2[i] + transfer * speeding[i]
+        moment = on.lever_m * bogie - own.lever_1_m * first[i] - own.lever_2_m * second[i]
+        first[i] += own.weight_1 * moment
+        second[i] += own.weight_2 * moment
+        left[i] = moment * hard
+        of_lead[i] = first[i] + second[i] - whole_1 * a_1[i] - whole_2 * a_2[i]
 
 
 @kernel

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from pre_core.crossing import mismatch as _mismatch
 from pre_core.crossing.mismatch import Mismatch
-from pre_core.crossing.noise import FORCE_MEMORY_S, NoisePath, noise_spectrum
+from pre_core.crossing.noise import NoisePath, noise_spectrum
 from pre_core.crossing.rows import RESIDUALS, RowFilter, filter_rows, phases, row_count
+from pre_core.crossing.suspension_noise import FORCE_MEMORY_S
 from pre_core.kernels.lanes import summing
 
 FloatArray = NDArray[np.float64]
@@ -51,7 +52,7 @@ def whitener(
     has_pavement = road is not None and road.pavement is not None
     everywhere = None if has_pavement else road
     spectrum = noise_spectrum(truck, density, force, everywhere, rows.omega) * rows.power
-    memory = FORCE_MEMORY_S if force.any() else 0.0
+    memory = FORCE_MEMORY_S + truck.lag_s if force.any() else 0.0
     if road is not None:
         memory = max(memory, _mismatch.correlation_time_s(road))
     turn = phases(rows, memory)

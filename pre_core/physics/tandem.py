@@ -1,4 +1,4 @@
-"""Contact forces of a truck with a load-equalised tandem behind its front axle.
+"""Contact forces of a truck with a tandem behind its front axle.
 
 An equaliser makes the two axles of the tandem share one spring force F_b in the ratio rho : 1 -
 rho, so that this force acts on the body at o_b = rho o_2 + (1 - rho) o_3. Heave and pitch then
@@ -10,6 +10,17 @@ whatever friction there is. With the readings a_1 and a_2 of the body above the 
 the distance D_0 behind it, z'' = (1 - d_1/D_0) a_1 + d_1/D_0 a_2 and theta'' = (a_1 - a_2)/D_0; the
 pitch inertia is I = kappa m_s d_1 (D_0 - d_1). The forces are proportional to 1/o_b, so that o_b =
 D_0 gives the half-car's m_11, m_22 and m_12 (`vehicle.masses_above_axles`).
+
+Where each axle has springs of its own, inertia determines only the moment of both forces about the
+front axle, o_2 F_2 + o_3 F_3 = o_b F_b. The remaining force comes from the law of the springs,
+S_i = k_i (z_ui - z_s(o_i)) + c_i (z_ui' - z_s'(o_i)), by the smallest correction that restores the
+moment,
+
+    F_i = S_i + w_i (o_b F_b - o_2 S_2 - o_3 S_3),    w_i = o_i/(o_2² + o_3²).
+
+Friction f_i, which the law leaves out, is then seen in the moment as o_2 f_2 + o_3 f_3, and remains
+as a force q on axle 2 and -q o_2/o_3 on axle 3, q = o_3 (o_3 f_2 - o_2 f_3)/(o_2² + o_3²). Friction
+of both axles that is independent and equally strong makes the two uncorrelated. (`Lead` selects.)
 """
 
 from typing import NamedTuple
@@ -38,6 +49,12 @@ class Lead(NamedTuple):
     unsprung_mass_kg: float
     tyre_stiffness_n_per_m: float
     tyre_damping_ns_per_m: float
+    suspension_stiffness_n_per_m: float = 0.0
+    """Nominal spring and damper, used where `is_equalised` is False."""
+    suspension_damping_ns_per_m: float = 0.0
+    is_equalised: bool = True
+    """Whether the axles of the tandem share one spring force; else each has a spring of its own,
+    which has the place of the springs in theta."""
 
 
 NO_LEAD = Lead(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -79,15 +96,122 @@ def shared_load(lead: Lead, theta: FloatArray, total_mass: float, gap: float) ->
     )
 
 
+class OwnSprings(NamedTuple):
+    """Levers of the forces of a tandem whose axles have springs of their own."""
+
+    lever_1_m: float
+    """Distance o_2 of the tandem's first axle behind the front axle."""
+    lever_2_m: float
+    weight_1: float
+    """Share w of the moment that the springs leave, in 1/m."""
+    weight_2: float
+
+
+@kernel
+def own_springs(lead: Lead, gap: float) -> OwnSprings:
+    """Return the levers for a distance `gap` between the tandem's axles."""
+    first, second = lead.ahead_m, lead.ahead_m + gap
+    both = first * first + second * second
+    return OwnSprings(first, second, first / both, second / both)
+
+
+def friction_passage(
+    lead: Lead, theta: FloatArray, gap: float, lag_s: float, omega: FloatArray
+) -> FloatArray:
+    """Return the factor (f,) from friction's power in o_b F_b/o_b to that in R_1 - R_2, in m²/N².
+
+    The first axle's profile is taken `lag_s` earlier. Zero for an equalised tandem.
+    """
+    if lead.is_equalised:
+        return np.zeros(omega.size)
+    on = own_springs(lead, gap)
+    both = on.lever_1_m**2 + on.lever_2_m**2
+    lever = lead.ahead_m + (1.0 - theta[SHARE]) * gap
+    each = (lever**2 / both) * (on.lever_2_m**2 / both)
+    s = 1j * omega
+    first, second = (theta[K_U1 + w] + theta[C_U1 + w] * s for w in range(2))
+    seen = np.exp(-s * lag_s) / first + on.lever_1_m / on.lever_2_m / second
+    return np.asarray(each * np.abs(seen) ** 2)
+
+
 def profile_equations(
     lead: Lead, theta: FloatArray, total_mass: float, gap: float, omega: FloatArray
 ) -> ComplexArray:
     """Return the truck's equations as factors of its accelerations: (4, 4, f), at `omega` (f,).
 
-    Rows are s² times the input profiles of both tandem axles, and the body's equations at the front
-    axle and at the bogie, in N per m; columns the two readings of the body and of both axles. The
-    last two rows have springs: of the bogie, and of the front axle on a flat road. They describe
-    how the truck answers to its profiles, and are no residuals.
+    Rows are s² times the input profiles of both tandem axles, and two equations of the body, in N
+    per m. Columns are the two readings of the body and of both axles.
+    """
+    if lead.is_equalised:
+        return _shared_equations(lead, theta, total_mass, gap, omega)
+    return _own_equations(lead, theta, total_mass, gap, omega)
+
+
+def _own_equations(
+    lead: Lead, theta: FloatArray, total_mass: float, gap: float, omega: FloatArray
+) -> ComplexArray:
+    """Return the equations of a tandem with springs of its own, as `profile_equations`.
+
+    The last row is the moment about the front axle, a residual; the third one, of the front axle on
+    a flat road, is none.
+    """
+    load, on = shared_load(lead, theta, total_mass, gap), own_springs(lead, gap)
+    s = 1j * omega
+    square = s**2
+    levers, weights = (on.lever_1_m, on.lever_2_m), (on.weight_1, on.weight_2)
+    springs = np.zeros((2, 4, s.size), dtype=np.complex128)
+    for w, lever in enumerate(levers):
+        law = theta[K_S1 + w] + theta[C_S1 + w] * s
+        place = lever / lead.readings_apart_m
+        springs[w, 0], springs[w, 1] = -(1.0 - place) * law, -place * law
+        springs[w, 2 + w] = law
+    left = -(levers[0] * springs[0] + levers[1] * springs[1])
+    left[0] += load.lever_m * load.bogie_1 * square
+    left[1] += load.lever_m * load.bogie_2 * square
+    force = np.stack([springs[w] + weights[w] * left for w in range(2)])
+    out = np.zeros((4, 4, s.size), dtype=np.complex128)
+    for w in range(2):
+        tyre = theta[K_U1 + w] + theta[C_U1 + w] * s
+        out[w] = force[w] / tyre
+        out[w, 2 + w] += 1.0 + theta[M_U1 + w] * square / tyre
+    out[2] = -force[0] - force[1]
+    out[2, 0] += (load.lead_1 + load.bogie_1) * square + _front_law(lead, s)
+    out[2, 1] += (load.lead_2 + load.bogie_2) * square
+    out[3] = left / load.lever_m
+    return out
+
+
+def sensor_responses(equations: ComplexArray) -> ComplexArray:
+    """Return the response (3, 8, f) of residuals to sensor noise, for springs of their own.
+
+    `equations` (4, 4, f) are those of `profile_equations`. Sources are the sensors at the times of
+    their own axles, then both pairs at the time of the other axle.
+    """
+    out = np.zeros((3, 8, equations.shape[2]), dtype=np.complex128)
+    for w, sign in ((0, 1.0), (1, -1.0)):
+        for source, channel in ((w, w), (2 + w, 2 + w), (4 + w, 1 - w), (6 + w, 3 - w)):
+            out[0, source] = sign * equations[w, channel]
+            if w == 1:
+                out[2, source] = equations[3, channel]
+    return out
+
+
+def _front_law(lead: Lead, s: NDArray[np.complexfloating]) -> ComplexArray:
+    """Return the force (f,) of the front axle's spring and tyre on a flat road, in N per m."""
+    front = lead.suspension_stiffness_n_per_m + lead.suspension_damping_ns_per_m * s
+    ground = lead.tyre_stiffness_n_per_m + lead.tyre_damping_ns_per_m * s
+    ground = ground + lead.unsprung_mass_kg * s**2
+    return np.asarray(front * ground / (front + ground))
+
+
+def _shared_equations(
+    lead: Lead, theta: FloatArray, total_mass: float, gap: float, omega: FloatArray
+) -> ComplexArray:
+    """Return the equations of an equalised tandem, as `profile_equations`.
+
+    The last two rows are the body's equations at the front axle, on a flat road, and at the bogie,
+    and have their springs: they describe how the truck answers to its profiles, and are no
+    residuals.
     """
     load = shared_load(lead, theta, total_mass, gap)
     shares = (theta[SHARE], 1.0 - theta[SHARE])

@@ -1,7 +1,7 @@
 """The command `driveby simulate`: crossings with a known truth and out-of-model effects."""
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from services.cli.parsing import (
     a_console,
@@ -15,6 +15,9 @@ from services.cli.parsing import (
 )
 from services.common.errors import InputError
 from services.common.options import number, numbers, whole
+
+if TYPE_CHECKING:
+    from schemas.site import Site
 
 
 def _ratios(text: str) -> tuple[float, ...]:
@@ -48,6 +51,7 @@ def add_simulate(commands: Any) -> None:
         help="flexural rigidity of each element over its undamaged value",
     )
     add_site(p, "truck and bridge (default: those of the paper)")
+    _add_axles(p)
     p.add_argument(
         "--road", choices=tuple("ABCDE"), default="A", help="ISO 8608 class (default: A)"
     )
@@ -87,6 +91,16 @@ def add_simulate(commands: Any) -> None:
     _add_surface(p.add_argument_group("two-dimensional road surface"))
     _add_beyond(p.add_argument_group("effects that a site file does not declare (default: none)"))
     add_output(p)
+
+
+def _add_axles(p: Any) -> None:
+    p.add_argument(
+        "--axles",
+        type=int,
+        choices=(2, 3),
+        help="axles of the truck; 3: a loaded tipper with an equalised tandem, unless the site's "
+        "truck has one (default: the site's truck, or 2)",
+    )
 
 
 def _add_schedule(p: Any) -> None:
@@ -259,10 +273,10 @@ def _simulate(options: argparse.Namespace) -> int:
     from services.simulation.schedule import schedule_of
 
     stiffness = options.bearing_stiffness
-    if options.site is not None:
-        known = load_site(options.site)
-        if known.vehicles[0].tandem is not None:
-            return _simulate_tandem(options, known)
+    known = None if options.site is None else load_site(options.site)
+    of_tandem = _with_tandem(options, known)
+    if of_tandem is not None:
+        return _simulate_tandem(options, of_tandem)
     return simulate_command(
         site=options.site,
         scenario=options.scenario,
@@ -293,6 +307,28 @@ def _simulate(options: argparse.Namespace) -> int:
     )
 
 
+def _with_tandem(options: argparse.Namespace, known: "Site | None") -> "Site | None":
+    """Return the site whose truck has a tandem, by itself or by `--axles`; None for two axles."""
+    from services.simulation.drive import paper_site
+    from services.simulation.usual_trucks import usual_tandem
+
+    truck = None if known is None else known.vehicles[0]
+    if truck is not None and truck.tandem is not None:
+        if options.axles == 2:
+            raise InputError(f"--axles: is 2, but {truck.id} has 3 axles")
+        if options.tyres:
+            raise InputError("--tyres: the site file has the tyres of its axles")
+        return known
+    if options.axles != 3:
+        return None
+    site = known or paper_site()
+    tipper = usual_tandem(options.noise, options.tyres or "twin")
+    rate = max(site.sensor.rate_hz)
+    sensors = tuple(one.model_copy(update={"rate_hz": rate}) for one in tipper.sensors)
+    tipper = tipper.model_copy(update={"sensors": sensors})
+    return site.model_copy(update={"vehicles": (tipper,), "ros2": ()})
+
+
 def _simulate_tandem(options: argparse.Namespace, site: Any) -> int:
     from services.common.files import check_writable
     from services.simulation.drive import ratios_of
@@ -300,7 +336,7 @@ def _simulate_tandem(options: argparse.Namespace, site: Any) -> int:
     from services.simulation.lane import driven_lane
     from services.simulation.schedule import schedule_of
 
-    names = ("bearing_stiffness", "departed_vehicle", "bilinear", "air_springs", "tyres")
+    names = ("bearing_stiffness", "departed_vehicle", "bilinear", "air_springs")
     for name in (*names, *_OF_PAVEMENT):
         if getattr(options, name):
             raise InputError(f"{option_of(name)}: is not simulated for a truck with a tandem")

@@ -7,7 +7,7 @@ the site file, and their signals are the readings, bit for bit.
 from collections.abc import Collection, Mapping
 from functools import lru_cache
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from pre_core.crossing.middle import (
     centre_reduction,
 )
 from pre_core.diagnostics.redundancy import RedundancyResidual, motion_ratio, redundancy_residual
-from schemas.errors import InputError
 from schemas.reasons import Reason
 from schemas.signals import CHANNELS
 from schemas.site import Sensor, Site, Vehicle
@@ -114,23 +113,35 @@ def middle_of(vehicle: Vehicle, acceleration: Floats) -> Floats:
 def middle_site(site: Site) -> Site:
     """Return the site as if its first truck, alone, had its four readings from four sensors.
 
-    Simulations have no roll, so the middle is all that can be measured. Raise InputError for a
-    truck with a tandem, which the plane simulation does not have.
+    Simulations measure in the middle, on a body above the two compared axles.
     """
     vehicle = site.vehicles[0]
-    if vehicle.tandem is not None:
-        raise InputError(
-            f"{vehicle.id}: has a tandem, it must be a truck of two axles: of a tandem only "
-            "`driveby simulate` computes crossings"
-        )
     if not vehicle.sensors:
         return site
+    sensor = middle_sensor(site.sensor, vehicle)
+    of_tandem = () if vehicle.tandem is None else _middle_sensors(sensor, vehicle)
     return site.model_copy(
         update={
-            "vehicles": (vehicle.model_copy(update={"sensors": ()}),),
-            "sensor": middle_sensor(site.sensor, vehicle),
+            "vehicles": (vehicle.model_copy(update={"sensors": of_tandem}),),
+            "sensor": sensor,
             "ros2": (),
         }
+    )
+
+
+def _middle_sensors(sensor: Sensor, vehicle: Vehicle) -> tuple[PlacedSensor, ...]:
+    """Return the four readings of a truck with a tandem as sensors in the middle."""
+    places: tuple[dict[str, Any], ...] = (
+        {"channel": "sprung_front", "on": "body", "position_m": 0.0},
+        {"channel": "sprung_rear", "on": "body", "position_m": vehicle.wheelbase_m},
+        {"channel": "unsprung_2", "on": "axle", "axle": 2},
+        {"channel": "unsprung_3", "on": "axle", "axle": 3},
+    )
+    return tuple(
+        PlacedSensor(**place, noise_density_ug_per_rthz=density, rate_hz=rate)
+        for place, density, rate in zip(
+            places, sensor.noise_density_ug_per_rthz, sensor.rate_hz, strict=True
+        )
     )
 
 

@@ -84,6 +84,9 @@ _LED_AWAY = 40.0
 _MISMATCH_EXCESS = 30.0
 """Largest tolerated ratio of measured to declared mismatch power: tyres twice as wide as declared,
 or tracks that differ by 20 cm where they are declared equal."""
+_TANDEM_FRICTION = 0.001
+"""Largest tolerated friction, over the static load, of a tandem's springs that do not share it. At
+0.002 the elements are known no better than to 40 %."""
 ALIKE_LOADS = 0.1
 """Share of the total load below which a difference between the axle loads counts as none. Equal
 loads make the effect of the road indistinguishable from that of the bridge."""
@@ -133,11 +136,14 @@ class Fit(NamedTuple):
     spread."""
     pavement_ratio: float = 1.0
     """Amplitude of the mismatch on the bridge over that off it, in waves of a metre."""
+    tandem_friction: float = 0.0
+    """Friction of a tandem's springs over their load, where they do not share it."""
 
 
 def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
     """Return the reasons not to trust a fit, the most significant first; none if it is sound."""
-    reasons = _of_the_rows(data, fit)
+    reasons = [Reason.TANDEM_FRICTION] if fit.tandem_friction > _TANDEM_FRICTION else []
+    reasons += _of_the_rows(data, fit)
     is_unexplained = bool({Reason.MODEL_MISFIT, Reason.RESIDUALS_COLOURED} & set(reasons))
     if fit.off_bridge_m < SHORTEST_APPROACH_M and (fit.has_two_roads or is_unexplained):
         reasons.append(Reason.APPROACH_TOO_SHORT)

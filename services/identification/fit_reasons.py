@@ -15,6 +15,7 @@ from pre_core.crossing.fit import Optimum, normal_approximation
 from pre_core.crossing.mismatch import pavement_ratio
 from pre_core.crossing.off_bridge import compared_length_m, mismatch_excess, rear_axle_chainage_m
 from pre_core.crossing.rows import RESIDUALS
+from pre_core.crossing.tandem_friction import tandem_friction
 from pre_core.search.loop import Termination
 from schemas.reasons import Reason
 from services.finding.crossing_data import CrossingData
@@ -62,6 +63,7 @@ def reasons_of_fit(
         **axles,
         Reason.NOISE_ABOVE_DECLARED: coarse,
         Reason.IMPLAUSIBLE_VEHICLE: odd_parameters(fit),
+        Reason.TANDEM_FRICTION: f"about {100.0 * fit.tandem_friction:.2g} % of their load",
     }
     return ReasonsOfFit((*axles, *reasons), about, bool(slipped) or is_misled_by_mismatch(fit))
 
@@ -70,6 +72,7 @@ def _fit(data: CrossingData, found: Optimum) -> Fit:
     """Return the input of the checks after the fit."""
     problem, y = found.problem, found.state.y
     where, rows = posterior.layout(problem), problem.rows
+    has_friction = bool(problem.force.any())
     white = posterior.data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)
     rows_of = parameters.table(data.bridge.elements, first_axle(data.vehicle))
     estimated = [rows_of[i] for i in np.flatnonzero(problem.priors.estimated)]
@@ -93,9 +96,12 @@ def _fit(data: CrossingData, found: Optimum) -> Fit:
         bool(problem.mismatch.level_m3.any()),
         compared_length_m(problem, y),
         speeds.speed_bias(problem, y),
-        shaking.coherence(problem, y) if problem.force.any() else 0.0,
+        shaking.coherence(problem, y)
+        if has_friction and not posterior.has_tandem(problem)
+        else 0.0,
         slip.largest_step(problem, found.state, covariance),
         mismatch_excess(problem, y) if problem.mismatch.level_m3.any() else 0.0,
         float(np.abs(moved).max()),
         pavement_ratio(problem.mismatch),
+        tandem_friction(problem, y),
     )

@@ -7,8 +7,6 @@ from pre_core.physics.tandem import NO_LEAD, Lead
 from schemas.site import Vehicle
 from schemas.site_axle_tables import TYRES, Axle
 
-SPRINGS: Final = ("suspension_stiffness_n_per_m", "suspension_damping_ns_per_m")
-"""Keys of the springs and dampers, which identification with a tandem does not use."""
 _TRACK_M: Final = 1.83
 """Track of axles with twin tyres."""
 
@@ -51,6 +49,9 @@ def lead_of(vehicle: Vehicle) -> Lead:
         tandem.lead.unsprung_mass_kg,
         tandem.lead.tyre_stiffness_n_per_m,
         tandem.lead.tyre_damping_ns_per_m,
+        tandem.lead.suspension_stiffness_n_per_m,
+        tandem.lead.suspension_damping_ns_per_m,
+        tandem.is_equalised,
     )
 
 

@@ -30,7 +30,7 @@ from services.finding.crossing_data import CrossingData
 from services.finding.placed import first_axle
 from services.identification.checks import stiffer_elements, undeclared_axles
 from services.identification.fit_reasons import reasons_of_fit
-from services.identification.footprints import SPRINGS, footprints_of, lead_of
+from services.identification.footprints import footprints_of, lead_of
 from services.identification.fusing import stored
 from services.identification.lane import lane_factor
 from services.identification.result_parts import (
@@ -147,8 +147,9 @@ def _priors(data: CrossingData) -> posterior.Priors:
     rows = parameters.table(bridge.elements)
     nominal = nominal_parameters(vehicle, bridge)
     tandem = vehicle.tandem
-    # No equation contains the springs of a truck with a tandem.
-    unused = np.array([tandem is not None and row.key in SPRINGS for row in rows])
+    # No equation contains the springs of a truck with an equalised tandem.
+    is_equalised = tandem is not None and tandem.is_equalised
+    unused = np.array([is_equalised and row.key in parameters.SPRINGS for row in rows])
     at_zero = (nominal == 0.0) & np.array([row.may_be_zero for row in rows])
     spread = [
         of[row.part].scale_at_zero(row.key) if zero else of[row.part].spread(row.key)

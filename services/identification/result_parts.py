@@ -87,11 +87,14 @@ def nominal_parameters(vehicle: Vehicle, bridge: Bridge) -> Floats:
     """Return the values of the site file (p,) in the order of `pre_core.parameters`."""
     of = {parameters.TRUCK: vehicle, parameters.BRIDGE: bridge}
     tandem = vehicle.tandem
+    of_axles: tuple[str, ...] = () if tandem is None else parameters.PAIRS
+    if tandem is not None and not tandem.is_equalised:
+        of_axles += parameters.SPRINGS
     return np.array(
         [
-            of[row.part].nominal(row.key)[row.which]
-            if tandem is None or row.key not in parameters.PAIRS
-            else getattr(tandem.axles[row.which], row.key)
+            getattr(tandem.axles[row.which], row.key)
+            if tandem is not None and row.key in of_axles
+            else of[row.part].nominal(row.key)[row.which]
             for row in parameters.table(bridge.elements)
         ]
     )

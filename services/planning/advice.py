@@ -13,7 +13,7 @@ from services.inspection.site import (
     noise_declared,
     sampling,
 )
-from services.planning.crossings import axles_of
+from services.planning.crossings import axles_of, has_declared_offset
 from services.planning.survey import MAX_CROSSINGS, PlanForecast, SurveyForecast
 
 _WORTH_NAMING: Final = 0.95
@@ -27,7 +27,10 @@ def advice(found: SurveyForecast) -> str:
 
 def tyres_of(outlook: PlanForecast) -> str:
     """Return the tyres of a plan in words."""
-    front, rear = axles_of(outlook.plan.site.vehicles[0])
+    vehicle = outlook.plan.site.vehicles[0]
+    front, rear = axles_of(vehicle)
+    if vehicle.tandem is not None:
+        return f"{'twin' if rear.twin_distance_m > 0.0 else 'single'} tyres on its tandem"
     if rear.twin_distance_m > 0.0:
         return "twin tyres behind"
     is_equal = rear._replace(offset_m=front.offset_m) == front
@@ -38,9 +41,14 @@ def mismatch_in_words(found: SurveyForecast) -> str:
     """Return the causes of profile mismatch in words, and whether they were given."""
     vehicle = found.planned.plan.site.vehicles[0]
     front, rear = axles_of(vehicle)
-    given = "" if vehicle.rear_axle_offset_m is not None else " (no rear_axle_offset_m)"
     offset_mm = 1e3 * abs(rear.offset_m - front.offset_m)
-    return f"rear axle offset {offset_mm:g} mm{given}, wheel paths ± {found.road.wander_m:g} m"
+    if vehicle.tandem is not None:
+        given = "" if has_declared_offset(vehicle) else " (no lateral_offset_m)"
+        which = "offset of axle 3 from 2"
+    else:
+        given = "" if has_declared_offset(vehicle) else " (no rear_axle_offset_m)"
+        which = "rear axle offset"
+    return f"{which} {offset_mm:g} mm{given}, wheel paths ± {found.road.wander_m:g} m"
 
 
 def percent(share: float) -> str:

@@ -7,9 +7,11 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from schemas.site import Bridge, Site, Vehicle
+from schemas.site_axle_tables import TYRES
 from schemas.site_vehicle import axle_loads_kg
 from services.identification.checks import loads_are_alike
 from services.planning.crossings import PlannedCrossing, axles_of
+from services.simulation.usual_trucks import usual_lorry, usual_tandem
 
 SPREAD: Final = 0.15
 """Relative deviation of a survey's speeds from the planned one, to either side."""
@@ -41,21 +43,16 @@ def as_planned(site: Site, speed_m_per_s: float) -> Plan:
 def alternatives(site: Site, speed_m_per_s: float) -> Iterator[Plan]:
     """Yield plans with one change each, as far as this site permits."""
     vehicle, bridge = site.vehicles[0], site.bridges[0]
-    front, rear = axles_of(vehicle)
     planned = _spread(site, speed_m_per_s)
-    is_equal = rear._replace(offset_m=front.offset_m) == front
-    if not is_equal or front.twin_distance_m > 0.0:
-        yield Plan(
-            "equal single tyres on both axles",
-            (_spread(with_tyres(site, "single"), speed_m_per_s),),
-        )
+    for name, other_truck in _other_trucks(site):
+        yield Plan(name, (_spread(other_truck, speed_m_per_s),))
     for factor in (_LIGHTER, _HEAVIER):
         loaded = _with_vehicle(site, _carrying(vehicle, factor))
         other = loaded.vehicles[0].total_mass_kg / 1e3
         yield Plan(
             f"half of the runs at {other:.1f} t", ((*planned, *_spread(loaded, speed_m_per_s)),)
         )
-    if loads_are_alike(vehicle):
+    if vehicle.tandem is None and loads_are_alike(vehicle):
         yield Plan(
             "load moved to the heavier axle",
             (_spread(_with_vehicle(site, _moved(vehicle)), speed_m_per_s),),
@@ -74,9 +71,47 @@ def alternatives(site: Site, speed_m_per_s: float) -> Iterator[Plan]:
             yield Plan(f"{elements} elements", (_spread(coarser, speed_m_per_s),))
 
 
+def _other_trucks(site: Site) -> Iterator[tuple[str, Site]]:
+    """Yield the same survey with other tyres, and with usual trucks of another kind.
+
+    Trucks with a tandem are simulated on one span of equal elements only.
+    """
+    vehicle, bridge = site.vehicles[0], site.bridges[0]
+    noise = max(site.sensor.noise_density_ug_per_rthz)
+    front, rear = axles_of(vehicle)
+    is_equal = rear._replace(offset_m=front.offset_m) == front
+    if vehicle.tandem is not None:
+        if front.twin_distance_m > 0.0:
+            yield "single tyres on the tandem", with_tyres(site, "single")
+        for name, tyres in (("twin tyres behind", "twin"), ("equal single tyres", "single")):
+            yield f"a lorry of two axles, {name}", _with_vehicle(site, usual_lorry(tyres))
+        return
+    if not is_equal or front.twin_distance_m > 0.0:
+        yield "equal single tyres on both axles", with_tyres(site, "single")
+    if not bridge.interior_supports_m and len(set(bridge.lengths_m)) == 1:
+        yield "a truck with an equalised tandem", _with_vehicle(site, usual_tandem(noise))
+
+
 def with_tyres(site: Site, behind: str) -> Site:
-    """Return a site with single tyres in front, and like single ones or twins `behind`."""
+    """Return a site with single tyres in front, and like single ones or twins `behind`.
+
+    Both axles of a tandem get the same tyres and one track.
+    """
     vehicle = site.vehicles[0]
+    if vehicle.tandem is not None:
+        of = TYRES[behind]
+        changed_axles = tuple(
+            axle.model_copy(
+                update={
+                    "tyres": behind,
+                    "tyre_width_m": of.width_m,
+                    "twin_tyre_distance_m": of.twin_distance_m,
+                }
+            )
+            for axle in vehicle.tandem.axles
+        )
+        axles = (vehicle.tandem.lead, *changed_axles)
+        return _with_vehicle(site, vehicle.model_copy(update={"axles": axles}))
     width = (vehicle.tyre_width_m or (0.25, 0.25))[0]
     twin = behind == "twin"
     changed = {
@@ -87,8 +122,15 @@ def with_tyres(site: Site, behind: str) -> Site:
 
 
 def with_noise(site: Site, densities_ug_per_rthz: tuple[float, ...]) -> Site:
-    """Return a site with other sensors."""
+    """Return a site with other sensors, of which a truck with a tandem names its own."""
     changed = {"noise_density_ug_per_rthz": densities_ug_per_rthz}
+    vehicle = site.vehicles[0]
+    if vehicle.sensors:
+        sensors = tuple(
+            one.model_copy(update={"noise_density_ug_per_rthz": density})
+            for one, density in zip(vehicle.sensors, densities_ug_per_rthz, strict=True)
+        )
+        site = _with_vehicle(site, vehicle.model_copy(update={"sensors": sensors}))
     return site.model_copy(update={"sensor": site.sensor.model_copy(update=changed)})
 
 
@@ -106,7 +148,18 @@ def _with_vehicle(site: Site, vehicle: Vehicle) -> Site:
 def _carrying(vehicle: Vehicle, factor: float) -> Vehicle:
     """Return the truck with a multiple of the load on its springs, at the same position."""
     total = sum(vehicle.unsprung_mass_kg) + factor * vehicle.sprung_mass_kg
-    return vehicle.model_copy(update={"total_mass_kg": round(total, 1)})
+    axles = tuple(
+        axle
+        if axle.load_kg is None
+        else axle.model_copy(
+            update={
+                "load_kg": axle.unsprung_mass_kg
+                + factor * max(axle.load_kg - axle.unsprung_mass_kg, 0.0)
+            }
+        )
+        for axle in vehicle.axles
+    )
+    return vehicle.model_copy(update={"total_mass_kg": round(total, 1), "axles": axles})
 
 
 def _moved(vehicle: Vehicle) -> Vehicle:

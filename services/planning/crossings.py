@@ -25,10 +25,13 @@ from pre_core.survey.plan import (
 from schemas.settings import IdentificationSettings
 from schemas.site import Site, Vehicle
 from services.common.errors import FailureError, InputError
+from services.drives.runs import Run
 from services.identification.footprints import footprints_of
 from services.simulation.data_alone import crossing_data_only, inputs_of_seen
 from services.simulation.drive import simulate_drive
+from services.simulation.drive_tandem import TandemDrive, tandem_case
 from services.simulation.wheel_paths import REAR_OFFSET_M
+from services.simulation.wide_crossings import drive_case
 
 Floats = NDArray[np.float64]
 
@@ -103,9 +106,16 @@ class CrossingSimulator:
 def axles_of(vehicle: Vehicle) -> tuple[Footprint, Footprint]:
     """Return the footprints of the axles, as far as declared; axles are set to millimetres."""
     front, rear = footprints_of(vehicle)
-    if vehicle.rear_axle_offset_m is None:
+    if not has_declared_offset(vehicle):
         rear = rear._replace(offset_m=REAR_OFFSET_M)
     return front, rear
+
+
+def has_declared_offset(vehicle: Vehicle) -> bool:
+    """Return whether the site file has the lateral offset between the compared axles."""
+    if vehicle.tandem is None:
+        return vehicle.rear_axle_offset_m is not None
+    return any(axle.lateral_offset_m is not None for axle in vehicle.tandem.axles)
 
 
 def mismatch_of(
@@ -126,15 +136,7 @@ def scale_error(site: Site) -> float:
 
 def _truth(crossing: PlannedCrossing, road: PlannedRoad) -> PosteriorAtTruth:
     site, speed = crossing.site, crossing.speed_m_per_s
-    drive = simulate_drive(
-        site,
-        np.ones(site.bridges[0].elements),
-        road_class=road.road_class,
-        seed=_ROAD_SEED,
-        speed_m_per_s=(speed, speed),
-        forward=crossing.forward,
-    )
-    found = crossing_data_only([drive.run], site, _SETTINGS)
+    found = crossing_data_only([_run(crossing, road)], site, _SETTINGS)
     if len(found) != 1:
         raise InputError(
             f"{site.bridges[0].id}: a crossing at {speed:g} m/s is not found in the positions of "
@@ -144,3 +146,21 @@ def _truth(crossing: PlannedCrossing, road: PlannedRoad) -> PosteriorAtTruth:
     # The common part of all sensors' gains is constant between runs: `scale_error` has it.
     apart = problem.priors._replace(common_gain_spread=0.0)
     return PosteriorAtTruth(problem._replace(priors=apart), y)
+
+
+def _run(crossing: PlannedCrossing, road: PlannedRoad) -> Run:
+    """Simulate the crossing without noise, all axles on one profile."""
+    site, speed = crossing.site, crossing.speed_m_per_s
+    sound = np.ones(site.bridges[0].elements)
+    if site.vehicles[0].tandem is not None:
+        of_road = (road.road_class, _ROAD_SEED)
+        how = TandemDrive(of_road, speed_m_per_s=speed, forward=crossing.forward)
+        return drive_case(tandem_case(site, sound, how), 0).run
+    return simulate_drive(
+        site,
+        sound,
+        road_class=road.road_class,
+        seed=_ROAD_SEED,
+        speed_m_per_s=(speed, speed),
+        forward=crossing.forward,
+    ).run

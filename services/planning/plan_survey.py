@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from schemas.site import Site
+from services.common.errors import InputError
 from services.finding.placed import middle_site
 from services.planning.alternatives import with_noise, with_tyres
 from services.planning.crossings import PlannedRoad
@@ -30,8 +31,17 @@ class SurveyWishes(NamedTuple):
 def plan_survey(
     given: Site, wishes: SurveyWishes, report: Callable[[int, int], None]
 ) -> SurveyForecast:
-    """Return the forecast; `report` receives the finished and all jobs."""
+    """Return the forecast; `report` receives the finished and all jobs.
+
+    Raise InputError for a tandem whose axles do not share their load.
+    """
     site = middle_site(given)
+    vehicle = site.vehicles[0]
+    if vehicle.tandem is not None and not vehicle.tandem.is_equalised:
+        raise InputError(
+            f"{vehicle.id}: its axles 2 and 3 have springs of their own, whose friction is unknown "
+            "before a drive; a survey is planned for an equalised tandem or for two axles"
+        )
     if wishes.tyres is not None:
         site = with_tyres(site, wishes.tyres)
     if wishes.noise_ug_per_rthz is not None:

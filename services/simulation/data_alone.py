@@ -8,10 +8,10 @@ from pre_core.crossing.preparation import CrossingInputs
 from schemas.reasons import Reason
 from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
-from schemas.signals import CHANNELS
 from schemas.site import Site
 from services.drives.runs import Run
 from services.finding.crossing_data import CrossingData
+from services.finding.placed import middle_of
 from services.identification.pre_method import inputs_of
 from services.identification.result_parts import CrossingTimes, rejected
 from services.simulation.drawn import IdentifiedCrossing, identify_simulated
@@ -35,5 +35,6 @@ def inputs_of_seen(seen: IdentifiedCrossing) -> CrossingInputs:
     """Return a crossing's input of method `pre`: all samples from the engine."""
     samples = seen.data.samples
     assert samples is not None  # noqa: S101 - a recording without any has no crossings
-    acceleration = np.stack([samples.channels[name] for name in CHANNELS])
-    return inputs_of(seen.data, seen.settings, acceleration, samples.start_s)
+    vehicle = seen.data.vehicle
+    acceleration = np.stack([samples.channels[name] for name in vehicle.channels])
+    return inputs_of(seen.data, seen.settings, middle_of(vehicle, acceleration), samples.start_s)

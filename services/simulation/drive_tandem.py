@@ -156,6 +156,8 @@ def tandem_case(site: Site, ratios: Floats, how: TandemDrive) -> WideCase:
         )
         if how.has_receiver_errors
         else SatelliteErrors(0.0, 0.0, 0.0),
+        vehicle.gps_antenna_to_front_axle_m,
+        of_receiver.latency_s,
     )
 
 
@@ -168,7 +170,10 @@ def _tables(site: Site) -> dict[str, dict[str, Any]]:
 
 
 def truck_with_tandem(vehicle: Vehicle, how: TandemDrive) -> WideTruck:
-    """Return the site's nominal truck with two sides; raise ValueError for one without a tandem."""
+    """Return the site's nominal truck with two sides; raise ValueError for one without a tandem.
+
+    Springs that do not share their load carry it in proportion to their stiffness.
+    """
     tandem = vehicle.tandem
     if tandem is None:
         raise ValueError("the truck has two axles")
@@ -208,7 +213,8 @@ def truck_with_tandem(vehicle: Vehicle, how: TandemDrive) -> WideTruck:
         vehicle.sprung_mass_kg * _ROLL_GYRATION_M**2,
         cg_height_m=vehicle.cg_height_m or 0.0,
     )
-    return WideTruck((body,), axles, (WideBogie((1, 2), (tandem.share, 1.0 - tandem.share)),))
+    shared = (WideBogie((1, 2), (tandem.share, 1.0 - tandem.share)),)
+    return WideTruck((body,), axles, shared if tandem.is_equalised else ())
 
 
 def _axle(axle: Axle, friction_kg: float, offset_m: float, shape: dict[str, Any]) -> WideAxle:

@@ -35,6 +35,10 @@ class SurveyKind(NamedTuple):
     """Largest height of joints at both ends of the bridge."""
     anisotropy: float = 1.0
     """Lateral correlation length of the surface over that of an isotropic one."""
+    has_tandem: bool = False
+    """A truck with an equalised tandem on a surface; `offset_m` is that of its second axle."""
+    friction_share: float = 0.0
+    """Friction of its springs over their static load."""
 
 
 KINDS: Final = {
@@ -59,6 +63,9 @@ KINDS: Final = {
     "single-smooth-deck": SurveyKind(
         10, tyres="single", masses_kg=(_LORRY_KG,), deck_roughness=0.5
     ),
+    "tandem": SurveyKind(12, has_tandem=True),
+    "tandem-rubbing": SurveyKind(12, has_tandem=True, friction_share=0.08),
+    "tandem-aside": SurveyKind(12, has_tandem=True, offset_m=0.02),
     "everything": SurveyKind(16, tyres="twin", masses_kg=(_LORRY_KG,), everything=True),
     "scenario-1": SurveyKind(16, scenario=1, noise_ug_per_rthz=100.0),
     "scenario-4": SurveyKind(16, scenario=4, noise_ug_per_rthz=100.0),

@@ -47,6 +47,11 @@ class TandemOptions(NamedTuple):
     runs: int = 1
     noise_ug: float = 25.0
     road_class: str = "A"
+    total_mass_kg: tuple[float, float] = TOTAL_MASS_KG
+    """Range of the truck's mass."""
+    span_m: tuple[float, float] = SPAN_M
+    is_declared: bool = True
+    """Whether the site file states how the axles share their load; otherwise it is `equalised`."""
 
 
 USUAL: Final = TandemOptions()
@@ -57,7 +62,7 @@ def draw_tandem(seed: int, options: TandemOptions = USUAL) -> WideCase:
     rng = np.random.default_rng(np.random.SeedSequence([seed, 0x7A2D]))
     u = rng.uniform
     truck = tandem_truck_of(rng, options)
-    span = round(float(u(*SPAN_M)), 1)
+    span = round(float(u(*options.span_m)), 1)
     elements = 5 if span < 26.0 else 7
     mass = 4400.0 * float(np.sqrt(span / 30.0) * u(0.8, 1.25))
     rigidity = mass * (2.0 * float(u(90.0, 115.0)) * span / np.pi) ** 2
@@ -96,7 +101,9 @@ def draw_tandem(seed: int, options: TandemOptions = USUAL) -> WideCase:
         sensors,
         runs,
         {
-            "vehicle": declared_tandem(truck, sensors, rng),
+            "vehicle": declared_tandem(
+                truck, sensors, rng, equalised=options.equalised or not options.is_declared
+            ),
             "bridge": declared_bridge(deck, float(rigidity), rng),
             "sensor": {"rate_hz": 500.0},
         },
@@ -106,7 +113,7 @@ def draw_tandem(seed: int, options: TandemOptions = USUAL) -> WideCase:
 def tandem_truck_of(rng: np.random.Generator, options: TandemOptions) -> WideTruck:
     """Draw a loaded lorry of three axles whose springs and tyres fit its load."""
     u = rng.uniform
-    total = float(u(*TOTAL_MASS_KG))
+    total = float(u(*options.total_mass_kg))
     ahead, gap, share = float(u(*AHEAD_M)), float(u(*GAP_M)), float(u(*SHARE))
     vary = np.exp(0.1 * rng.standard_normal(10))
     own = np.array([650.0, 1050.0, 1050.0]) * vary[:3]
@@ -163,9 +170,13 @@ def tandem_sensors(truck: WideTruck, noise_ug: float) -> tuple[WideSensor, ...]:
 
 
 def declared_tandem(
-    truck: WideTruck, sensors: tuple[WideSensor, ...], rng: np.random.Generator
+    truck: WideTruck,
+    sensors: tuple[WideSensor, ...],
+    rng: np.random.Generator,
+    *,
+    equalised: bool = True,
 ) -> dict[str, Any]:
-    """Return the vehicle's table, with an equalised bogie, as its owner would write it."""
+    """Return the vehicle's table, with a bogie of axles 2 and 3, as its owner would write it."""
     weighed = static_axle_loads_n(truck) / STANDARD_GRAVITY_M_PER_S2
     axles = [
         {
@@ -198,6 +209,6 @@ def declared_tandem(
         "cg_height_m": 1.3,
         "total_mass_kg": round(truck.total_mass_kg, 1),
         "axles": axles,
-        "bogies": [{"axles": [2, 3], "equalised": True}],
+        "bogies": [{"axles": [2, 3], "equalised": equalised}],
         "sensors": placed,
     }

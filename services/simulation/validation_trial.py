@@ -41,9 +41,11 @@ from schemas.validation_records import (
     pair_hash,
 )
 from services.common.errors import FailureError
+from services.drives.runs import Run
 from services.finding.placed import middle_sensor, middle_site
 from services.recordings.recording import program_version
 from services.simulation.drawn import CrossingTruth, draw_truth, drive, identify_simulated
+from services.simulation.drawn_tandem import drawn_tandem
 from services.simulation.drive import beam_of
 from services.simulation.out_of_model import WANDER_M
 from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
@@ -212,10 +214,11 @@ def conditions_of(vehicle: Vehicle, bridge: Bridge, site: Site) -> ValidationCon
     """Return road, speed and sensors from the site file, or the usual ones."""
     sensor = middle_sensor(site.sensor, vehicle)
     twin = vehicle.twin_tyre_distance_m is not None and vehicle.twin_tyre_distance_m[1] > 0.0
+    is_surface = twin or bool(vehicle.rear_axle_offset_m) or vehicle.tandem is not None
     return ValidationConditions(
         speed_m_per_s=bridge.survey_speed_m_per_s or _SPEED_M_PER_S,
         road_class=bridge.road_class or _ROAD_CLASS,
-        road="surface" if twin or vehicle.rear_axle_offset_m else "groove",
+        road="surface" if is_surface else "groove",
         # A simulated truck has one rate, the lowest of its sensors'.
         rate_hz=min(sensor.rate_hz),
         noise_density_ug_per_rthz=sensor.noise_density_ug_per_rthz,
@@ -237,14 +240,24 @@ def one_crossing(
         "ei_ratio": tuple((truth.beam.flexural_rigidity_nm2 / nominal).tolist()),
     }
     try:
-        drawn = drive(site, truth, seed, noise_ug_per_rthz=conditions.noise_density_ug_per_rthz)
+        run, declared = _driven(site, truth, conditions, seed)
     except FailureError as error:
         _log.warning("crossing %d was not simulated: %s", seed, error)
         return _not_simulated(site, seed)
-    found = identify_simulated([drawn.run], drawn.site, settings)
+    found = identify_simulated([run], declared, settings)
     if len(found) != 1:
         return ValidationCrossing.model_validate(went_in | {"verdict": "not_found"})
     return ValidationCrossing.model_validate(went_in | _came_out(found[0].result, nominal.tolist()))
+
+
+def _driven(
+    site: Site, truth: CrossingTruth, conditions: ValidationConditions, seed: int
+) -> tuple[Run, Site]:
+    """Return the recorded run of a crossing, and the site that declares its sensors."""
+    if site.vehicles[0].tandem is not None:
+        return drawn_tandem(site, truth, seed, seed).driven.run, site
+    drawn = drive(site, truth, seed, noise_ug_per_rthz=conditions.noise_density_ug_per_rthz)
+    return drawn.run, drawn.site
 
 
 def _not_simulated(site: Site, seed: int) -> ValidationCrossing:
@@ -270,7 +283,7 @@ def _truth(
             rate_hz=conditions.rate_hz,
         ),
         paths=wheel_paths_of(vehicle, SurfaceOptions(None, None, WANDER_M))
-        if conditions.road == "surface"
+        if conditions.road == "surface" and vehicle.tandem is None
         else None,
     )
     if number % 3 != 1:

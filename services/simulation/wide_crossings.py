@@ -116,6 +116,10 @@ class WideCase(NamedTuple):
     """Tables and keys of the site file."""
     rate_hz: float = 500.0
     receiver: SatelliteErrors = USUAL_RECEIVER
+    antenna_to_front_axle_m: float = 0.0
+    """Distance of the receiver's antenna behind the first axle."""
+    latency_s: float = 0.0
+    """Latency of the receiver's time stamps."""
 
 
 class WideDrivenRun(NamedTuple):
@@ -248,14 +252,16 @@ def _fixes(
     errors = case.receiver
     slow = errors.slow_m * rng.standard_normal(2)
     white = errors.noise_m * rng.standard_normal((2, at.size))
-    along = np.interp(at, response.time_s, response.position_m) + slow[0] + white[0]
+    sign = 1.0 if response.position_m[-1] > response.position_m[0] else -1.0
+    antenna = response.position_m - sign * case.antenna_to_front_axle_m
+    along = np.interp(at, response.time_s, antenna) + slow[0] + white[0]
     beside = lane_m + slow[1] + white[1]
     speed = np.abs(
         np.interp(at, response.time_s, np.gradient(response.position_m, response.time_s))
     )
     latitude, longitude = to_lat_lon(bridge_frame(site_of(case).bridges[0]), along, beside)
     return GnssTrack(
-        clock_s + at,
+        clock_s + at + case.latency_s,
         latitude,
         longitude,
         _ALTITUDE_M + _ALTITUDE_NOISE_M * rng.standard_normal(at.size),

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.results import CrossingResult, Prior, unresolved_note
+from schemas.results import CrossingResult, Prior, first_compared_axle, unresolved_note
 from services.identification.comparison import (
     Comparison,
     Estimate,
@@ -147,6 +147,22 @@ class CrossingView(NamedTuple):
     """Residual bins; None where the samples are not available."""
     unresolved: frozenset[int] = frozenset()
     """Numbers of the elements too uncertain to resolve a loss of half their EI."""
+    first_axle: int = 1
+    """Number of the first of the two compared axles: "front" in the names of files and fields."""
+
+    @property
+    def axle_names(self) -> dict[str, str]:
+        """Names of the compared axles in words, by "front" and "rear"."""
+        if self.first_axle == 1:
+            return {"front": "front wheel", "rear": "rear wheel"}
+        return {"front": f"axle {self.first_axle}", "rear": f"axle {self.first_axle + 1}"}
+
+    @property
+    def difference_name(self) -> str:
+        """Name of the difference of both profiles."""
+        if self.first_axle == 1:
+            return "front − rear"
+        return f"axle {self.first_axle} − axle {self.first_axle + 1}"
 
     @property
     def span_m(self) -> float:
@@ -243,6 +259,7 @@ def view_of_crossing(crossing: CrossingResult, bridge: ElementGeometry) -> Cross
         scale_error=crossing.scale_error or 0.0,
         resolution=unresolved_note(crossing),
         unresolved=unresolved,
+        first_axle=first_compared_axle(crossing),
     )
 
 

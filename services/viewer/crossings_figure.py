@@ -122,6 +122,16 @@ def _draw_intervals(
     return highest
 
 
+def _wheel(wheel: str, crossings: Sequence[tuple[int, CrossingView]], language: Language) -> str:
+    """Return the names of the axles that are `wheel` ("front" or "rear") of some crossing."""
+    found = []
+    for first in sorted({one.first_axle for _, one in crossings}):
+        number = first if wheel == "front" else first + 1
+        of_pair = language.text(f"figure.{wheel}")
+        found.append(of_pair if first == 1 else language.text("figure.axle", number=number))
+    return ", ".join(found)
+
+
 def _draw_roads(
     axes: Axes, crossings: Sequence[tuple[int, CrossingView]], language: Language
 ) -> None:
@@ -131,7 +141,7 @@ def _draw_roads(
         write_centred(axes, language.text("figure.none"))
         return
     for wheel, line in (("front", "-"), ("rear", (0, (3.2, 2.2)))):
-        axes.plot([], [], color=MUTED, linestyle=line, label=language.text(f"figure.{wheel}"))
+        axes.plot([], [], color=MUTED, linestyle=line, label=_wheel(wheel, crossings, language))
         for place, road in roads:
             axes.plot(
                 road.x_m,

@@ -16,7 +16,6 @@ from services.viewer.crossing_view import (
     VEHICLE_COLOURS,
     CrossingView,
     FloatArray,
-    RoadView,
     comparison_of,
     describe_crossing,
     summary_line,
@@ -101,7 +100,7 @@ def draw_crossing(
     _draw_rigidity(rigidity, crossing, element_truth)
     if has_road:
         _draw_profiles(panels[1], crossing, road_truth)
-        _draw_differences(panels[2], crossing.road, road_truth)
+        _draw_differences(panels[2], crossing, road_truth)
     for axes in panels:
         simplify_axes(axes)
         mark_bridge(axes, (0.0, *crossing.interior_supports_m, crossing.span_m))
@@ -188,7 +187,7 @@ def _draw_profiles(
             road.front_m * 1e3,
             color=VEHICLE_COLOURS["front"],
             linewidth=1.7,
-            label="profile of the front wheel",
+            label=_profile_of(crossing, "front"),
         )
         axes.plot(
             road.x_m,
@@ -196,15 +195,21 @@ def _draw_profiles(
             color=VEHICLE_COLOURS["rear"],
             linewidth=1.7,
             linestyle=(0, (3.2, 2.2)),
-            label="profile of the rear wheel",
+            label=_profile_of(crossing, "rear"),
         )
     legend_beside_title(axes)
 
 
+def _profile_of(crossing: CrossingView, which: str) -> str:
+    article = "the " if crossing.first_axle == 1 else ""
+    return f"profile of {article}{crossing.axle_names[which]}"
+
+
 def _draw_differences(
-    axes: Axes, road: RoadView | None, truth: tuple[FloatArray, FloatArray] | None
+    axes: Axes, crossing: CrossingView, truth: tuple[FloatArray, FloatArray] | None
 ) -> None:
     axes.set_title("Differences")
+    road = crossing.road
     if road is None:
         _leave_empty(axes)
         return
@@ -224,7 +229,7 @@ def _draw_differences(
         between * factor,
         color=INK,
         linewidth=1.1,
-        label="front − rear",
+        label=crossing.difference_name,
     )
     legend_beside_title(axes)
 

@@ -98,6 +98,11 @@ def _time_panel(crossings: Sequence[CrossingView], *, has_results: bool) -> rrb.
     )
 
 
+def _difference_title(crossing: CrossingView) -> str:
+    first = crossing.first_axle
+    return "Front minus rear" if first == 1 else f"Axle {first} minus axle {first + 1}"
+
+
 def _crossing_layout(
     crossing: CrossingView, channels: Set[str], bridge: BridgeOnMap | None
 ) -> rrb.Container:
@@ -107,7 +112,7 @@ def _crossing_layout(
     if crossing.road is not None:
         plots = [
             _plot(f"{root}/road", "Road profile (mm)"),
-            _plot(f"{root}/road_difference", "Front minus rear (mm)"),
+            _plot(f"{root}/road_difference", f"{_difference_title(crossing)} (mm)"),
             *plots,
         ]
     coloured = crossing.rigidity_nm2 is not None

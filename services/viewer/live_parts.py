@@ -123,8 +123,10 @@ def log_roads(stream: TimestampedStream, root: str, crossing: CrossingView) -> N
             draw_order=1.0 if wheel == "front" else 2.0,
         )
         stream.log(f"{entity}/{wheel}", line)
+    names = crossing.axle_names
+    under = "both wheels" if crossing.first_axle == 1 else f"{names['front']} and {names['rear']}"
     apart_mm = 1e3 * float(np.sqrt(np.mean((road.front_m - road.rear_m) ** 2)))
-    label = f"road under both wheels, ± {1e3 * largest_m:.1f} mm; they differ by {apart_mm:.2g} mm"
+    label = f"road under {under}, ± {1e3 * largest_m:.1f} mm; they differ by {apart_mm:.2g} mm"
     place = np.array([STRIP_WIDTH / 2.0]), np.array([ROADS_MIDDLE + ROADS_REACH + 5.0])
     log_labels(stream, f"{entity}/name", [label], *place)
 

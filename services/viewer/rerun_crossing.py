@@ -452,11 +452,11 @@ def _log_road(recording: RerunStream, root: str, crossing: CrossingView) -> None
         entity = f"{root}/road/{wheel}"
         # The two lines coincide: the one drawn first is wider, so that both are visible.
         width = 3.5 if wheel == "front" else 1.2
-        log_line(recording, entity, f"{wheel} wheel", VEHICLE_COLOURS[wheel], width=width)
+        log_line(recording, entity, crossing.axle_names[wheel], VEHICLE_COLOURS[wheel], width=width)
         send_scalars(recording, entity, height_m * 1e3, time_ns=time_ns, chainage_m=road.x_m)
         log_round_beginning(recording, entity, road.x_m)
     entity = f"{root}/road_difference/front_minus_rear"
-    log_line(recording, entity, "front − rear", MUTED)
+    log_line(recording, entity, crossing.difference_name, MUTED)
     send_scalars(
         recording, entity, (road.front_m - road.rear_m) * 1e3, time_ns=time_ns, chainage_m=road.x_m
     )

@@ -140,6 +140,7 @@ def _by_band(left: FittedResiduals) -> ResidualCells:
     mean_square, excess = np.full((kinds, 3, bands), np.nan), np.zeros((kinds, 3, bands))
     found = quality.residual_bins(left.white, left.stretch, left.step_s, np.array(BANDS_HZ))
     for place, cell in found.items():
-        if cell.size:
+        # Of a tandem that shares its load no body equation is a residual.
+        if cell.size and left.white[:, place[0]].any():
             mean_square[place], excess[place] = cell.mean_square, quality.bin_excess(cell)
     return ResidualCells(mean_square, excess, BANDS_HZ)

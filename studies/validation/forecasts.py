@@ -29,7 +29,7 @@ def forecasts_of(site: Site, found: Sequence[FusedSurvey]) -> dict[str, Forecast
         plan = _plan(site, kind)
         nominal = np.array(plan.site.bridges[0].nominal_flexural_rigidity_nm2)
         ratios = [one.truth / nominal for one in found if one.kind == name]
-        road = PlannedRoad("A", kind.wander_m, is_surface=kind.tyres is not None)
+        road = PlannedRoad("A", kind.wander_m, is_surface=kind.tyres is not None or kind.has_tandem)
         spreads = forecasts(road, plan, kind.crossings, ratios)
         out[name] = Forecast(
             float(np.median(np.concatenate([one.elements for one in spreads]))),
@@ -50,8 +50,18 @@ def _plan(site: Site, kind: SurveyKind) -> Plan:
 
 
 def _with_wheels(site: Site, kind: SurveyKind) -> Site:
+    if kind.has_tandem:
+        return _with_offset(site, kind.offset_m)
     if kind.tyres is None:
         return site
     known = with_tyres(site, kind.tyres)
     aside = known.vehicles[0].model_copy(update={"rear_axle_offset_m": kind.offset_m})
     return known.model_copy(update={"vehicles": (aside,)})
+
+
+def _with_offset(site: Site, offset_m: float) -> Site:
+    """Return a site whose truck's last axle runs `offset_m` to the left of the others."""
+    vehicle = site.vehicles[0]
+    last = vehicle.axles[-1].model_copy(update={"lateral_offset_m": offset_m})
+    aside = vehicle.model_copy(update={"axles": (*vehicle.axles[:-1], last)})
+    return site.model_copy(update={"vehicles": (aside,)})

@@ -21,12 +21,16 @@ from schemas.results import BridgeResult, CrossingResult
 from schemas.settings import IdentificationSettings
 from schemas.site import Site, Vehicle
 from services.common.progress import Steps, no_step_progress
+from services.drives.runs import Run
+from services.finding.placed import middle_site
 from services.identification.bridge_state import RecentCrossings, add_crossings, state_of, usable
 from services.simulation.drawn import CrossingTruth, draw_truth, drive, identify_simulated
+from services.simulation.drawn_tandem import TandemWorld, drawn_tandem
 from services.simulation.drive import declared_site, ratios_of
 from services.simulation.out_of_model import draw_out_of_model
 from services.simulation.pavement import Pavement
 from services.simulation.survey_kinds import KINDS, SurveyKind
+from services.simulation.usual_trucks import usual_tandem
 from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
 from studies.validation.calibration import Aim, Record
 from studies.validation.worlds import completed, identity_of, read_records
@@ -50,9 +54,8 @@ def one_crossing(
     of = KINDS[kind]
     truck = number % len(of.masses_kg)
     site = site_of_truck(site, of, truck)
-    truth, seed = crossing_truth(site, of, survey, number, truck)
-    drawn = drive(site, truth, seed)
-    found = identify_simulated([drawn.run], drawn.site, settings)
+    run, declared = _driven(site, of, survey, number, truck)
+    found = identify_simulated([run], declared, settings)
     crossing = None
     if len(found) == 1:
         # All are simulated at the same time; results of one survey have names of their own.
@@ -76,9 +79,22 @@ def one_crossing(
     }
 
 
+def _driven(site: Site, of: SurveyKind, survey: int, number: int, truck: int) -> tuple[Run, Site]:
+    """Return the recorded run of a crossing, and the site that declares its sensors."""
+    truth, seed = crossing_truth(site, of, survey, number, truck)
+    if of.has_tandem:
+        world = TandemWorld(of.friction_share, of.offset_m, wander_m=of.wander_m)
+        drawn = drawn_tandem(site, truth, seed, 1000 * survey + truck, world)
+        return drawn.driven.run, drawn.site
+    one = drive(site, truth, seed)
+    return one.run, one.site
+
+
 def site_of_truck(site: Site, kind: SurveyKind, truck: int) -> Site:
     """Return the owner's site file for a truck of a survey."""
     vehicle, bridge = site.vehicles[0], site.bridges[0]
+    if kind.has_tandem:
+        vehicle = usual_tandem(kind.noise_ug_per_rthz)
     mass = kind.masses_kg[truck]
     if mass is not None:
         vehicle = _of_mass(vehicle, mass).model_copy(update={"id": f"truck-{truck}"})
@@ -91,6 +107,8 @@ def sites_of(site: Site, kind: SurveyKind) -> list[Site]:
     """Return the declared sites of each truck of a survey, with its sensors."""
     axles = kind.noise_ug_per_rthz
     body = _BODY_NOISE_UG if kind.everything else axles
+    if kind.has_tandem:
+        return [middle_site(site_of_truck(site, kind, 0))]
     return [
         declared_site(site_of_truck(site, kind, truck), (body, body, axles, axles), _RATE_HZ)
         for truck in range(len(kind.masses_kg))

@@ -12,6 +12,7 @@ import pytest
 
 from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import posterior
+from pre_core.crossing.noise import no_force_noise
 from pre_core.crossing.off_bridge import off_bridge_residuals
 from pre_core.crossing.posterior import ChainageFixes, Priors
 from pre_core.crossing.preparation import (
@@ -20,6 +21,7 @@ from pre_core.crossing.preparation import (
     update_noise,
 )
 from pre_core.crossing.rows import RESIDUALS
+from pre_core.crossing.tandem_friction import tandem_friction
 from pre_core.parameters import (
     C_S1,
     C_U1,
@@ -35,10 +37,10 @@ from pre_core.parameters import (
     table,
 )
 from pre_core.physics.surface import Footprint
-from pre_core.physics.tandem import Lead, shared_load
+from pre_core.physics.tandem import Lead, friction_passage, shared_load
 from pre_core.physics.vehicle import masses_above_axles
 from services.simulation.tandem_cases import TandemOptions, draw_tandem
-from services.simulation.two_sided import WideTruck, axle_row, body_row
+from services.simulation.two_sided import WideTruck, axle_row, body_row, static_axle_loads_n
 from services.simulation.wide_crossings import (
     SatelliteErrors,
     WideCase,
@@ -58,8 +60,8 @@ class Driven(NamedTuple):
 
 
 @cache
-def driven(friction: float = 0.08) -> Driven:
-    case = draw_tandem(3, TandemOptions(friction_share=friction))
+def driven(friction: float = 0.08, equalised: bool = True) -> Driven:
+    case = draw_tandem(3, TandemOptions(friction_share=friction, equalised=equalised))
     sensors = tuple(
         one._replace(gain_error=0.0, delay_s=0.0, bias_m_per_s2=0.0, noise_ug_per_rthz=0.0)
         for one in case.sensors
@@ -70,6 +72,7 @@ def driven(friction: float = 0.08) -> Driven:
 
 
 def lead_of(truck: WideTruck) -> Lead:
+    """Return the front axle; the tandem is equalised if the truck has a bogie."""
     front = truck.axles[0]
     middle = round(0.5 * (truck.axles[1].position_m + truck.axles[2].position_m), 3)
     return Lead(
@@ -78,7 +81,17 @@ def lead_of(truck: WideTruck) -> Lead:
         front.mass_kg,
         front.tyre_stiffness_n_per_m,
         front.tyre_damping_ns_per_m,
+        front.suspension_stiffness_n_per_m,
+        front.suspension_damping_ns_per_m,
+        bool(truck.bogies),
     )
+
+
+def static_share(truck: WideTruck) -> float:
+    """Return the share of the static spring forces on the first axle of the tandem."""
+    own = STANDARD_GRAVITY_M_PER_S2 * np.array([axle.mass_kg for axle in truck.axles])
+    first, second = (static_axle_loads_n(truck) - own)[1:]
+    return float(first / (first + second))
 
 
 def gap_of(truck: WideTruck) -> float:
@@ -91,7 +104,7 @@ def theta_of(case: WideCase) -> np.ndarray:
     body, lead = truck.bodies[0], lead_of(truck)
     theta = np.zeros(len(names(len(deck.flexural_rigidity_nm2))))
     theta[D_1] = body.cg_position_m
-    theta[SHARE] = truck.bogies[0].shares[0]
+    theta[SHARE] = static_share(truck)
     reach = body.cg_position_m * (lead.readings_apart_m - body.cg_position_m)
     theta[KAPPA] = body.pitch_inertia_kg_m2 / (body.mass_kg * reach)
     theta[K_S1] = truck.axles[0].suspension_stiffness_n_per_m
@@ -100,6 +113,9 @@ def theta_of(case: WideCase) -> np.ndarray:
     theta[K_S1 + 1] = sum(axle.suspension_stiffness_n_per_m for axle in behind)
     theta[C_S1 + 1] = sum(axle.suspension_damping_ns_per_m for axle in behind)
     for w, axle in enumerate(behind):
+        if not truck.bogies:
+            theta[K_S1 + w] = axle.suspension_stiffness_n_per_m
+            theta[C_S1 + w] = axle.suspension_damping_ns_per_m
         theta[M_U1 + w] = axle.mass_kg
         theta[K_U1 + w] = axle.tyre_stiffness_n_per_m
         theta[C_U1 + w] = axle.tyre_damping_ns_per_m
@@ -120,7 +136,9 @@ def inputs_of(of: Driven, acceleration: np.ndarray | None = None) -> CrossingInp
     rows = table(len(deck.flexural_rigidity_nm2), 2)
     at_zero = (theta == 0.0) & np.array([row.may_be_zero for row in rows])
     spread = np.where(at_zero, 1e-9, 0.1)
-    estimated = (theta > 0.0) & ~np.isin(np.arange(theta.size), range(C_S1, K_S1 + 2))
+    estimated = theta > 0.0
+    if truck.bogies:
+        estimated &= ~np.isin(np.arange(theta.size), range(C_S1, K_S1 + 2))
     lead, gap = lead_of(truck), gap_of(truck)
     response = of.run.response
     shift = of.run.entry_s - np.interp(0.0, response.position_m, response.time_s)
@@ -224,13 +242,68 @@ def test_profiles_of_the_tandem_agree_at_the_truth() -> None:
     assert np.sum((worse - white[on, 0]) ** 2) > 50.0
 
 
-def test_sensor_noise_has_unit_variance_once_whitened() -> None:
-    of = driven()
+def test_profiles_agree_on_springs_of_their_own_without_friction() -> None:
+    problem, y = build_problem(inputs_of(driven(0.0, False)))
+    for _ in range(3):
+        problem = update_noise(problem, y, no_force_noise())
+    white = posterior.data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)
+    before, behind = off_bridge_residuals(problem, y)
+    on = slice(before.stop, behind.start)
+    assert np.sqrt(np.mean(white[before, 0] ** 2)) < 0.35
+    assert np.sqrt(np.mean(white[on, 0] ** 2)) < 0.6
+    assert np.sqrt(np.mean(white[:, 2] ** 2)) < 0.6  # the moment about the front axle
+    assert not white[:, 1].any()
+    soft = problem._replace(
+        priors=problem.priors._replace(
+            theta=np.where(
+                np.arange(problem.priors.theta.size) == K_S1,
+                0.9 * problem.priors.theta,
+                problem.priors.theta,
+            )
+        )
+    )
+    worse = posterior.data_rows(soft, y[None, :])[0].reshape(-1, RESIDUALS)
+    assert np.sqrt(np.mean(worse[:, 2] ** 2)) > 3.0
+
+
+def test_friction_of_own_springs_is_found_in_the_moment() -> None:
+    problem, y = build_problem(inputs_of(driven(0.04, False)))
+    assert tandem_friction(problem, y) == 0.0
+    rough = update_noise(problem, y)
+    # Springs that hardly slide: the friction changes by a part of its limit only.
+    assert 0.005 < tandem_friction(rough, y) < 0.04
+    assert posterior.suspension_weight(rough, y) < 0.05
+    smooth, y = build_problem(inputs_of(driven(0.0, False)))
+    assert tandem_friction(update_noise(smooth, y), y) < 0.001
+    equalised, y = build_problem(inputs_of(driven()))
+    assert tandem_friction(update_noise(equalised, y), y) == 0.0
+
+
+def test_friction_passes_to_the_profiles_as_a_projection() -> None:
+    lead = Lead(4.6, 5.275, 700.0, 2e6, 0.0, 3e5, 2e4, False)
+    theta = theta_of(driven(0.0, False).case)
+    omega, lag_s = np.array([0.5, 6.0, 40.0]), 0.13
+    levers = np.array([4.6, 5.95])
+    share = theta[SHARE]
+    # Friction of unit power in both springs, less the part that the moment determines.
+    left = np.eye(2) - np.outer(levers, levers) / (levers @ levers)
+    in_moment = (levers @ levers) / (share * levers[0] + (1.0 - share) * levers[1]) ** 2
+    for w, found in zip(omega, friction_passage(lead, theta, 1.35, lag_s, omega), strict=True):
+        tyres = theta[K_U1 : K_U1 + 2] + 1j * w * theta[C_U1 : C_U1 + 2]
+        to_profiles = np.array([np.exp(-1j * w * lag_s), -1.0]) / tyres
+        expected = to_profiles @ left @ left.T @ to_profiles.conj()
+        assert found * in_moment == pytest.approx(expected.real)
+
+
+@pytest.mark.parametrize("equalised", [True, False])
+def test_sensor_noise_has_unit_variance_once_whitened(equalised: bool) -> None:
+    of = driven(0.0, equalised)
     count = of.run.run.accel_time_s.size
     rng = np.random.default_rng(5)
     noise = DENSITY * np.sqrt(0.5 * of.run.run.rate_hz) * rng.standard_normal((4, count))
     problem, y = build_problem(inputs_of(of, noise))
-    white = posterior.data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)[:, 0]
+    white = posterior.data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)
     before, behind = off_bridge_residuals(problem, y)
-    off = np.concatenate([white[before], white[behind]])
-    assert np.mean(off**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / off.size))
+    for kind in (0,) if equalised else (0, 2):
+        off = np.concatenate([white[before, kind], white[behind, kind]])
+        assert np.mean(off**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / off.size))

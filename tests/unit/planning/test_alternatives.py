@@ -3,11 +3,16 @@
 import pytest
 
 from schemas.site import Bridge, Site
+from schemas.site_file import parse_site, site_toml
 from schemas.site_vehicle import axle_loads_kg
+from services.finding.placed import middle_site
 from services.planning.alternatives import Plan, alternatives, as_planned, with_noise, with_tyres
 from services.planning.crossings import axles_of
 from services.planning.survey import middle_elements
 from services.simulation.drive import paper_site
+from services.simulation.usual_trucks import usual_tandem
+
+SPANS = {"interior_supports_m": (15.0,), "elements": 8}
 
 
 def named(site: Site) -> dict[str, Plan]:
@@ -55,6 +60,45 @@ def test_alike_axles_are_loaded_otherwise() -> None:
     plan = named(site.model_copy(update={"vehicles": (alike,)}))["load moved to the heavier axle"]
     front, rear = axle_loads_kg(plan.site.vehicles[0])
     assert abs(front - rear) > 0.1 * (front + rear)
+
+
+def test_another_kind_of_truck_is_proposed() -> None:
+    name = "a truck with an equalised tandem"
+    site = named(with_noise(paper_site(), (7.0,) * 4))[name].site
+    vehicle = site.vehicles[0]
+    assert vehicle.tandem is not None
+    assert vehicle.tandem.is_equalised
+    assert {one.noise_density_ug_per_rthz for one in vehicle.sensors} == {7.0}
+    assert site.bridges == paper_site().bridges
+    # The simulation of a tandem has one span of equal elements.
+    two = Bridge.model_validate(paper_site().bridges[0].model_dump() | SPANS)
+    assert name not in named(paper_site().model_copy(update={"bridges": (two,)}))
+
+
+def test_a_truck_with_a_tandem_is_compared_with_lorries() -> None:
+    site = middle_site(paper_site().model_copy(update={"vehicles": (usual_tandem(10.0),)}))
+    plans = named(site)
+    lighter = next(plan for name, plan in plans.items() if name.startswith("half of the runs at"))
+    assert parse_site(site_toml(lighter.tracks[0][2].site), "a").vehicles[0].tandem is not None
+    single = plans["single tyres on the tandem"].site.vehicles[0]
+    assert [one.twin_distance_m for one in axles_of(single)] == [0.0, 0.0]
+    for name, distance in (("twin tyres behind", 0.33), ("equal single tyres", 0.0)):
+        lorry = plans[f"a lorry of two axles, {name}"].site.vehicles[0]
+        assert lorry.tandem is None
+        front, rear = axles_of(lorry)
+        assert rear.twin_distance_m == distance
+        assert (rear._replace(offset_m=front.offset_m) == front) == (distance == 0.0)
+    quiet = plans["sensors of a quarter of the noise"].site.vehicles[0]
+    assert {one.noise_density_ug_per_rthz for one in quiet.sensors} == {2.5}
+    assert "single tyres on the tandem" not in named(plans["single tyres on the tandem"].site)
+
+
+def test_offset_of_a_tandem_is_a_few_millimetres_unless_declared() -> None:
+    vehicle = usual_tandem(10.0)
+    assert axles_of(vehicle)[1].offset_m == 0.005
+    last = vehicle.axles[2].model_copy(update={"lateral_offset_m": 0.02})
+    aside = vehicle.model_copy(update={"axles": (*vehicle.axles[:2], last)})
+    assert axles_of(aside)[1].offset_m == 0.02
 
 
 def test_fewer_elements_end_at_the_supports_all_the_same() -> None:

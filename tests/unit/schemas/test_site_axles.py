@@ -9,7 +9,7 @@ from schemas.errors import InputError
 from schemas.site import Vehicle
 from schemas.site_file import faults_of_site, load_site, parse_site, site_hash, site_toml
 from schemas.vehicle_info import differences, vehicle_part
-from services.identification.footprints import footprints_of
+from services.identification.footprints import footprints_of, lead_of
 
 TEXT = (Path(__file__).parents[2] / "data" / "csv_example" / "site.toml").read_text()
 BEHIND = TEXT[TEXT.index("[bridge]") :]
@@ -231,10 +231,6 @@ def test_both_spellings_are_refused_by_both_keys(key: str, value: str, other: st
             "vehicle.bogies joins axles of a truck of two, it must be of axles 2 and 3",
         ),
         (
-            (HEAD, FRONT, REAR, REAR.replace("= 5.0", "= 6.3")),
-            "vehicle.bogies does not join axles 2 and 3, they must share their load by an",
-        ),
-        (
             (HEAD, "track_m = 'wide'\n", FRONT, REAR),
             'vehicle.track_m is "wide", it must be a length in m or a pair [front, rear]',
         ),
@@ -283,8 +279,24 @@ def test_shares_move_the_force_of_a_tandem() -> None:
     assert again.tandem_share == pytest.approx(0.55)
 
 
-def test_a_tandem_is_written_as_it_was_read() -> None:
-    text = TANDEM_HEAD + "track_m = 1.85\n" + FRONT + REAR + LAST + BOGIE + SENSORS + BEHIND
+@pytest.mark.parametrize("bogie", ["", BOGIE.replace("true", "false")])
+def test_axles_on_springs_of_their_own_are_weighed(bogie: str) -> None:
+    vehicle = vehicle_of(TANDEM_HEAD, FRONT, REAR, LAST, bogie, SENSORS)
+    tandem = vehicle.tandem
+    assert tandem is not None
+    assert not tandem.is_equalised
+    # Of 10.0 and 9.8 t 8.9 and 8.6 t are on the springs, each known to 2 % of the load.
+    assert tandem.share == pytest.approx(8.9 / 17.5)
+    assert tandem.share_spread == pytest.approx(8.6 / 17.5 * hypot(0.2 / 8.9, 0.196 / 8.6))
+    assert lead_of(vehicle).suspension_stiffness_n_per_m == 3.0e5
+    unknown = LAST.replace("load_kg = 9800\n", "")
+    line = complaint(TANDEM_HEAD, FRONT, REAR, unknown, bogie, SENSORS)
+    assert line.startswith("vehicle.axles[2].load_kg is missing, it must be a mass in kg")
+
+
+@pytest.mark.parametrize("bogie", [BOGIE, ""])
+def test_a_tandem_is_written_as_it_was_read(bogie: str) -> None:
+    text = TANDEM_HEAD + "track_m = 1.85\n" + FRONT + REAR + LAST + bogie + SENSORS + BEHIND
     site = parse_site(text, "a")
     again = parse_site(site_toml(site), "b")
     assert again == site
@@ -298,7 +310,14 @@ def test_a_tandem_is_written_as_it_was_read() -> None:
 @pytest.mark.parametrize(
     ("parts", "line"),
     [
-        ((BOGIE.replace("true", "false"), SENSORS), "vehicle.bogies[0].equalised is false"),
+        (
+            (BOGIE.replace("true", "false") + "shares = [0.5, 0.5]\n", SENSORS),
+            "vehicle.bogies[0].shares are of axles that share their load, remove them or set",
+        ),
+        (
+            (BOGIE + BOGIE, SENSORS),
+            "vehicle.bogies does not join axles 2 and 3, it must be one bogie of these",
+        ),
         (
             (BOGIE + "shares = [0.9, 0.1]\n", SENSORS),
             "vehicle.bogies[0].shares give one axle 90% of the force, it must be at most 80%",
@@ -354,10 +373,10 @@ def _with_bogie(keys: str) -> str:
 @pytest.mark.parametrize(
     ("parts", "line"),
     [
-        (FRONT, "vehicle.axles has 1 entry, it must be two [[vehicle.axles]], or three of which"),
+        (FRONT, "vehicle.axles has 1 entry, it must be two [[vehicle.axles]], or three: a front"),
         (
             FRONT + "".join(REAR.replace("5.0", f"{5 + k}.0") for k in range(20)),
-            "vehicle.axles has 21 entries, it must be two [[vehicle.axles]], or three of which",
+            "vehicle.axles has 21 entries, it must be two [[vehicle.axles]], or three: a front",
         ),
         (
             FRONT + _with_bogie("axles = [2]"),

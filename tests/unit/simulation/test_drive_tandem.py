@@ -5,17 +5,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from schemas.errors import InputError
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.site_file import parse_site
 from services.cli.main import main
+from services.common.geodesy import bridge_frame, to_chainage
 from services.execution.offline import identify_recordings, site_of
+from services.finding.placed import middle_site
+from services.simulation.drawn import draw_truth
+from services.simulation.drawn_tandem import TandemWorld, drawn_tandem, drawn_vehicle
 from services.simulation.drive_tandem import TandemDrive, tandem_case
 from services.simulation.tandem_cases import draw_tandem
 from services.simulation.two_sided import static_axle_loads_n
+from services.simulation.usual_trucks import usual_tandem
 from services.simulation.wheel_paths import SurfaceOptions
-from services.simulation.wide_crossings import site_text
+from services.simulation.wide_crossings import drive_case, site_text
 
 TEXT = site_text(draw_tandem(12))
 SITE: Site = parse_site(TEXT, "site.toml")
@@ -60,13 +66,95 @@ def test_options_without_a_tandem_are_refused(
     assert line in capsys.readouterr().err
 
 
-def test_survey_of_a_tandem_is_refused_in_one_line(
+def test_survey_on_springs_of_their_own_is_refused_in_one_line(
     site_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    site_file.write_text(TEXT.replace("equalised = true", "equalised = false"))
     assert main(["survey", "--site", str(site_file), "--loss", "0.2"]) == 2
     error = capsys.readouterr().err
-    assert "tandem-truck: has a tandem, it must be a truck of two axles" in error
+    assert "tandem-truck: its axles 2 and 3 have springs of their own" in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (["--axles", "2"], "--axles: is 2, but tandem-truck has 3 axles"),
+        (["--tyres", "twin"], "--tyres: the site file has the tyres of its axles"),
+    ],
+)
+def test_options_contradicting_a_tandem_are_refused(
+    site_file: Path, capsys: pytest.CaptureFixture[str], options: list[str], line: str
+) -> None:
+    out = str(site_file.with_name("a.mcap"))
+    given = ["simulate", "--site", str(site_file), "--ei", "1,1,1,1,1", "-o", out, *options]
+    assert main(given) == 2
+    assert line in capsys.readouterr().err
+
+
+def test_three_axles_are_those_of_a_usual_tipper(tmp_path: Path) -> None:
+    path = tmp_path / "tandem.mcap"
+    given = ["simulate", "--scenario", "6", "--axles", "3", "--noise", "25", "--rate", "200"]
+    assert main([*given, "-o", str(path)]) == 0
+    site = site_of([path], None)
+    assert site.vehicles[0].total_mass_kg == usual_tandem(25.0).total_mass_kg
+    assert {one.noise_density_ug_per_rthz for one in site.vehicles[0].sensors} == {25.0}
+
+
+def test_springs_of_their_own_carry_the_load_by_their_stiffness() -> None:
+    site = parse_site(TEXT.replace("equalised = true", "equalised = false"), "site.toml")
+    case = tandem_case(site, np.ones(site.bridges[0].elements), TandemDrive(("A", 1)))
+    assert case.truck.bogies == ()
+    assert static_axle_loads_n(case.truck).sum() == pytest.approx(
+        G * site.vehicles[0].total_mass_kg
+    )
+
+
+def test_antenna_and_latency_are_in_the_positions() -> None:
+    ones = np.ones(SITE.bridges[0].elements)
+    front = tandem_case(SITE, ones, TandemDrive(("A", 1)))._replace(rate_hz=200.0)
+    behind = front._replace(antenna_to_front_axle_m=2.0, latency_s=0.25)
+    at_front, at_antenna = (drive_case(case, 0).run.gnss for case in (front, behind))
+    frame = bridge_frame(SITE.bridges[0])
+    along = [to_chainage(frame, g.latitude_deg, g.longitude_deg)[0] for g in (at_front, at_antenna)]
+    np.testing.assert_allclose(along[0] - along[1], 2.0, atol=1e-3)
+    np.testing.assert_allclose(at_antenna.time_s - at_front.time_s, 0.25, atol=1e-6)
+
+
+def test_drawn_truck_varies_about_the_declared_one() -> None:
+    vehicle = SITE.vehicles[0]
+    drawn = [drawn_vehicle(vehicle, seed) for seed in range(200)]
+    assert drawn_vehicle(vehicle, 3) == drawn[3]
+    for key, spread in (
+        ("total_mass_kg", vehicle.total_mass_kg_spread),
+        ("front_axle_to_cg_m", vehicle.front_axle_to_cg_m_spread),
+        ("tandem_share", vehicle.tandem_share_spread),
+    ):
+        logs = np.log([getattr(one, key) / getattr(vehicle, key) for one in drawn])
+        assert abs(logs.mean()) < 4.0 * spread / np.sqrt(200)
+        assert logs.std() == pytest.approx(spread, rel=0.2)
+    stiffness = np.array([[a.tyre_stiffness_n_per_m for a in one.axles] for one in drawn])
+    nominal = [axle.tyre_stiffness_n_per_m for axle in vehicle.axles]
+    np.testing.assert_allclose(np.log(stiffness / nominal).std(axis=0), 0.15, rtol=0.2)
+    assert np.abs(np.corrcoef(stiffness.T) - np.eye(3)).max() < 0.3
+
+
+def test_drawn_crossing_has_the_errors_of_the_truth() -> None:
+    site = middle_site(SITE)
+    truth = draw_truth(site, 5)
+    how = truth.conditions._replace(rate_hz=200.0, speed_m_per_s=12.0, change_m_per_s=0.0)
+    truth = truth._replace(conditions=how)
+    world = TandemWorld(friction_share=0.08, offset_m=0.02, outer_share=0.55, wander_m=0.0)
+    drawn = drawn_tandem(site, truth, 7, 1, world)
+    case = drawn.case
+    np.testing.assert_allclose(case.deck.flexural_rigidity_nm2, truth.beam.flexural_rigidity_nm2)
+    assert [one.delay_s for one in case.sensors] == truth.channels.delay_s.tolist()
+    assert (case.truck.axles[2].offset_m, case.truck.axles[2].outer_share) == (0.02, 0.55)
+    assert case.truck.axles[1].friction_n > 0.0
+    assert drawn_tandem(site, truth, 7, 1, world).case == case
+    own = parse_site(TEXT.replace("equalised = true", "equalised = false"), "site.toml")
+    with pytest.raises(InputError, match="axles 2 and 3 have springs of their own"):
+        drawn_tandem(own, truth, 7, 1)
 
 
 def test_other_methods_reject_a_tandem(site_file: Path) -> None:

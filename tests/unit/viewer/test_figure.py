@@ -200,3 +200,12 @@ def test_nothing_is_left_behind_where_it_cannot_be_written(tmp_path: Path):
 def test_pyplot_and_its_global_state_are_not_touched():
     code = "import sys, services.viewer.figure; sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_profiles_of_a_tandem_are_named_by_axle_number() -> None:
+    figure = draw(view(first_axle=2), truth=False)
+    written = {text.get_text() for text in words(figure)}
+    assert {"profile of axle 2", "profile of axle 3", "axle 2 − axle 3"} < written
+    assert not any("front" in text for text in written)
+    of_two = {text.get_text() for text in words(draw(view()))}
+    assert {"profile of the front wheel", "profile of the rear wheel", "front − rear"} < of_two
