@@ -77,7 +77,10 @@ class Coordinates(NamedTuple):
 
 
 class OffBridgeMismatch(NamedTuple):
-    """Mismatch in m at begin_m, begin_m + `OFF_BRIDGE_STEP_M`, …; NaN where it is unknown."""
+    """Mismatch in m at begin_m, begin_m + `OFF_BRIDGE_STEP_M`, …; NaN where it is unknown.
+
+    It is scaled to the level on the bridge, where the pavement may be another one.
+    """
 
     begin_m: float
     value_m: FloatArray
@@ -379,4 +382,4 @@ def _off_bridge(found: Optimum) -> OffBridgeMismatch:
         order = np.argsort(place)
         inside = (x > place.min()) & (x < place.max())
         out[inside] = np.interp(x[inside], place[order], value[order])
-    return OffBridgeMismatch(float(x[0]), out)
+    return OffBridgeMismatch(float(x[0]), out * np.sqrt(long_wave_power(problem.mismatch)))
