@@ -158,6 +158,11 @@ NOT_RUN = {
     "python tests/numerics/table.py": LONG,
     "make tables": "tests/contract/test_tables.py compares the pages",
     "python -m studies.scripts.reproduction frequencies": LONG,
+    "python -m studies.scripts.pavement --crossings 4": LONG,
+    "python -m studies.scripts.pavement --crossings 2 --decks 2.5 --joints 15 --anisotropy 3.5": (
+        LONG
+    ),
+    "python -m studies.scripts.pavement --search --crossings 1 --decks 2.5": LONG,
     "python -m pytest -m slow tests/studies/test_validation.py": LONG,
     "python -m tests.verdicts.measure": LONG,
     "python -m tests.verdicts.measure signals 300": LONG,
