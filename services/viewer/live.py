@@ -16,8 +16,7 @@ import threading
 import time
 import webbrowser
 from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 from urllib.parse import quote
 
 import rerun as rr
@@ -34,6 +33,7 @@ from services.common.errors import FailureError, InputError
 from services.viewer.live_layout import WAITING, waiting_blueprint
 from services.viewer.live_view import LiveView
 from services.viewer.rerun_parts import log_markdown
+from services.viewer.settings import Show, ViewSettings
 from services.viewer.view import check_ended_well, prepare_viewer, viewer_arguments
 
 _log = logging.getLogger(__name__)
@@ -49,32 +49,21 @@ _PERIOD_S: Final = 0.5
 _TRIES: Final = 120
 """Number of checks whether the page is available."""
 
-Show = Literal["window", "web"]
 
-
-def live_command(
-    *,
-    endpoint: str,
-    realm: str,
-    site: Path | None,
-    tls: Path | None,
-    show: Show | None,
-    address: str,
-    port: int,
-    print_line: Callable[[str], None],
-) -> int:
+def live_command(asked: ViewSettings, print_line: Callable[[str], None]) -> int:
     """Show a realm until the viewer is closed or a signal arrives; return 0.
 
-    `show` None only serves it. Viewers connect to `address`, at a `port` (0: any free one). The
-    command waits for the router without limit.
+    Viewers connect to the address `listen`, at a `port` (0: any free one). The command waits for
+    the router without limit.
 
     Raise InputError for a bad realm, site file or address, FailureError if the port is taken, or
     the viewer is absent or fails.
     """
+    realm, show, address = asked.realm, asked.show, asked.listen
     check_listenable(realm)
-    known = None if site is None else load_site(site)
+    known = None if asked.site is None else load_site(asked.site)
     _check_address(address)
-    chosen = _free_port(address, port)
+    chosen = _free_port(address, asked.port)
     if show is not None:
         prepare_viewer()
     with (
@@ -85,14 +74,14 @@ def live_command(
         recording.set_sinks(sink)
         recording.send_recording_name(realm)
         recording.send_blueprint(waiting_blueprint())
-        log_markdown(recording, WAITING, f"Waiting for a router at {endpoint}.")
+        log_markdown(recording, WAITING, f"Waiting for a router at {asked.address}.")
         print_line(f"realm {realm}, live at {sink.uri}; more viewers: rerun {sink.uri}")
         with _viewer(sink.uri, show, address, print_line) as viewer:
 
             def is_over() -> bool:
                 return stop.is_set() or _has_ended(viewer)
 
-            with open_listener(endpoint, tls, realm, is_over, past_s=_PAST_S) as heard:
+            with open_listener(asked.address, asked.tls, realm, is_over, past_s=_PAST_S) as heard:
                 if heard is not None:
                     _draw(recording, LiveView(recording, known), heard, stop, is_over)
         recording.disconnect()

@@ -32,6 +32,7 @@ from services.viewer.crossing_view import elements_of_result
 from services.viewer.live import APPLICATION, live_command
 from services.viewer.live_parts import PERIOD_S, extremes
 from services.viewer.live_view import MAX_TRUCKS, LiveView
+from services.viewer.settings import ViewSettings
 from tests.endpoints import free_port
 from tests.unit.cli.watching import alarm
 from tests.unit.viewer.found import results_of, some_crossing
@@ -374,8 +375,6 @@ def test_a_port_that_is_taken_is_not_shared(tmp_path: Path) -> None:
         port = free_port()
         other.bind(("127.0.0.1", port))
         other.listen()
+        asked = ViewSettings(target="live", endpoint="tcp/127.0.0.1:1", serve=True, port=port)
         with pytest.raises(FailureError, match=f"port {port}: .*; give another --port"):
-            live_command(
-                endpoint="tcp/127.0.0.1:1", realm="live", site=None, tls=None, show=None,
-                address="127.0.0.1", port=port, print_line=print,
-            )  # fmt: skip
+            live_command(asked, print)
