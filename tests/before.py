@@ -213,7 +213,7 @@ def _filled(message: AnyMessage) -> AnyMessage:
     for field in message.DESCRIPTOR.fields:
         is_map = field.message_type is not None and field.message_type.GetOptions().map_entry
         into = getattr(message, field.name)
-        if is_map:
+        if is_map and field.message_type is not None:
             value = field.message_type.fields_by_name["value"]
             if value.message_type is None:
                 into[field.name] = _value(value)
@@ -228,7 +228,7 @@ def _filled(message: AnyMessage) -> AnyMessage:
     return message
 
 
-def _value(field: FieldDescriptor) -> Any:
+def _value(field: Any) -> Any:
     if field.enum_type is not None:
         return field.enum_type.values[-1].number
     match field.cpp_type:

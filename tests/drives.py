@@ -1,7 +1,8 @@
 """Recordings of many drives, made from one: the same crossing again and again, at other times."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from schemas.signals import (
     NS_PER_S,
@@ -23,7 +24,12 @@ SAMPLE = Path(__file__).parents[1] / "recordings" / "sample" / "crossing.mcap"
 EXACT = Path(__file__).parent / "data" / "noise_free.mcap"
 """For least squares: 0.1 s a crossing and not one."""
 APART_NS = 600 * NS_PER_S
-_DECODE = {"accel": decode_accel, "gnss": decode_gnss, "info": decode_info}
+AnySignal = AccelBatch | GnssFix | VehicleInfo
+_DECODE: dict[str, Callable[[bytes], AnySignal]] = {
+    "accel": decode_accel,
+    "gnss": decode_gnss,
+    "info": decode_info,
+}
 
 
 def drives(folder: Path, crossings: int, each: int = 1, source: Path = EXACT) -> list[Path]:
@@ -50,14 +56,12 @@ def drives(folder: Path, crossings: int, each: int = 1, source: Path = EXACT) ->
     return paths
 
 
-def _later(
-    once: list[tuple[Message, AccelBatch | GnssFix | VehicleInfo]], number: int
-) -> Iterator[Message]:
+def _later(once: list[tuple[Message, AnySignal]], number: int) -> Iterator[Message]:
     """The messages of a drive `number` times ten minutes later, as of another boot."""
     by = number * APART_NS
     for message, said in once:
         boot_id = message.boot_id + number
-        times = {"boot_id": boot_id, "wall_time_ns": said.wall_time_ns + by}
+        times: dict[str, Any] = {"boot_id": boot_id, "wall_time_ns": said.wall_time_ns + by}
         match said:
             case AccelBatch():
                 payload = encode_accel(said._replace(**times))

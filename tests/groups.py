@@ -86,7 +86,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> "Grouped | N
     return Grouped(config, log) if config.getvalue("dist") == "loadgroup" else None
 
 
-class Grouped(LoadGroupScheduling):
+class Grouped(LoadGroupScheduling):  # type: ignore[misc]  # xdist has no types
     """The scheduler of pytest-xdist, with the groups that a worker has written."""
 
     @cached_property

@@ -38,7 +38,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     """With pytest-xdist every worker collects the same tests and reports to the controller."""
     sent = getattr(session.config, "workeroutput", None)
     if sent is not None:
-        sent[_SENT] = dict(session.config.stash[_DESELECTED])
+        sent[_SENT] = dict(session.config.stash[_DESELECTED].items())
 
 
 @pytest.hookimpl(optionalhook=True)

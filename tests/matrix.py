@@ -129,14 +129,24 @@ def tried(one: Environment, wheel: Path, out: Path, matching: str) -> Outcome:
         ).stdout.split()[1]
         bounds = folder / "lowest.txt"
         bounds.write_text("\n".join(lowest()) if one.is_lowest else "")
-        install = [python, "-m", "pip", "install", "--quiet", "-c", bounds]
+        install: list[str | Path] = [python, "-m", "pip", "install", "--quiet", "-c", bounds]
         code, _ = run(*install, f"{wheel}[all]", *RUNNERS, *NEEDED_BY_TESTS)
         if code:
             return Outcome(one, version, "", f"cannot be installed: {folder / 'log.txt'}", False)
         checkout = folder / "tests-only"
         copied(checkout)
         demo, demo_s = run(python.with_name("driveby"), "demo", cwd=folder)
-        command = [python, "-m", "pytest", "-n", "2", "--dist", "loadgroup", "-q", *SELECTION]
+        command: list[str | Path] = [
+            python,
+            "-m",
+            "pytest",
+            "-n",
+            "2",
+            "--dist",
+            "loadgroup",
+            "-q",
+            *SELECTION,
+        ]
         command += [f"--deselect={name}" for name in READS_SOURCES]
         code, _ = run(*command, *(["-k", matching] if matching else []), cwd=checkout)
     last = (folder / "log.txt").read_text().strip().splitlines()[-1].strip("= ")
@@ -146,7 +156,7 @@ def tried(one: Environment, wheel: Path, out: Path, matching: str) -> Outcome:
 
 def copied(checkout: Path) -> None:
     """Copy the tests and what they read, importing the modules under the wheel's names."""
-    setup = runpy.run_path(str(ROOT / "setup.py"))
+    setup = runpy.run_path(str(ROOT / "setup.py"), run_name="setup")
     rewritten: Callable[[bytes, str], bytes] = setup["moved_inside"]
     for name in COPIED:
         source, target = ROOT / name, checkout / name

@@ -7,11 +7,11 @@ from tests.waiting import until
 def several(subscription: Subscription, number: int) -> list[RawSample]:
     """The next messages, as many as there must be."""
     received: list[RawSample] = []
-    until(
-        lambda: (
-            received.extend(one for one in [subscription.receive(0.2)] if one is not None)
-            or len(received) >= number
-        ),
-        f"{number} messages",
-    )
+
+    def has_enough() -> bool:
+        if (one := subscription.receive(0.2)) is not None:
+            received.append(one)
+        return len(received) >= number
+
+    until(has_enough, f"{number} messages")
     return received

@@ -241,8 +241,9 @@ def take_terminal(folder: Path, columns: int, lines: int = 36) -> bytes:
     listened = Listened(alive={"truck-1", "truck-2"})
     watched = a_fleet(load_site(ROOT / "docs/site.example.toml"))
     where = "realm live at tcp/127.0.0.1:7447"
-    moment = {"now_s": NOW_S, "now_ns": NOW_NS}
-    shown.print(page(watched, where, listened, **moment, width=columns, height=lines))
+    shown.print(
+        page(watched, where, listened, now_s=NOW_S, now_ns=NOW_NS, width=columns, height=lines)
+    )
     svg = shown.export_svg(title="driveby watch")
     width, height = (float(size) for size in re.findall(r'viewBox="0 0 (\S+) (\S+)"', svg)[0])
     drawn = folder / "terminal.svg"

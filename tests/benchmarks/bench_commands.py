@@ -141,13 +141,13 @@ def _python(*arguments: str) -> str:
     return done.stdout
 
 
-def test_memory_of_the_search(benchmark: BenchmarkFixture):
+def test_memory_of_the_search(benchmark: BenchmarkFixture) -> None:
     _python("-c", _MEMORY.replace("random_walk.STEPS", "2"))
     output = benchmark.pedantic(lambda: _python("-c", _MEMORY), rounds=1)
     benchmark.extra_info |= json.loads(output)
 
 
-def test_start_of_help(benchmark: BenchmarkFixture):
+def test_start_of_help(benchmark: BenchmarkFixture) -> None:
     program = Path(sys.executable).with_name("driveby")
     command = [str(program)] if program.exists() else [sys.executable, "-m", "services"]
 
@@ -164,7 +164,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_start_of_identify(benchmark: BenchmarkFixture, recording: Path):
+def test_start_of_identify(benchmark: BenchmarkFixture, recording: Path) -> None:
     """The command as a user runs it; what is beyond the work: that wall time less the work's."""
     command = ["-m", "services", "identify", str(recording), "--method", "least-squares"]
     benchmark.pedantic(lambda: _python(*command), rounds=7, warmup_rounds=1)
@@ -193,7 +193,7 @@ def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_identify_pre(benchmark: BenchmarkFixture, noisy: Path):
+def test_identify_pre(benchmark: BenchmarkFixture, noisy: Path) -> None:
     """One crossing from recording to result as a user waits for it, and where the time goes."""
     command = ["-m", "services", "identify", str(noisy)]
     benchmark.pedantic(lambda: _python(*command), rounds=7, warmup_rounds=1)

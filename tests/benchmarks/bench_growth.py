@@ -52,14 +52,14 @@ def _record(
     }
 
 
-def test_growth_with_steps(benchmark: BenchmarkFixture):
+def test_growth_with_steps(benchmark: BenchmarkFixture) -> None:
     """A longer crossing: the same bridge at 40 to 2.5 m/s, each at 1 ms."""
     windows = [cases.noise_window(speed_m_per_s=v) for v in (40.0, 20.0, 10.0, 5.0, 2.5)]
     seconds = benchmark.pedantic(_seconds, args=([_Size(w) for w in windows],), rounds=1)
     _record(benchmark, [w.signals.shape[2] for w in windows], seconds)
 
 
-def test_growth_with_modes(benchmark: BenchmarkFixture):
+def test_growth_with_modes(benchmark: BenchmarkFixture) -> None:
     """Seven elements of four parts each, as a basis of 7 to 56 coordinates, at 10 m/s."""
     counts = [7, 14, 28, 56]
     windows = [cases.noise_window(parts=4, coordinates=c) for c in counts]
@@ -67,7 +67,7 @@ def test_growth_with_modes(benchmark: BenchmarkFixture):
     _record(benchmark, counts, seconds)
 
 
-def test_growth_with_elements(benchmark: BenchmarkFixture):
+def test_growth_with_elements(benchmark: BenchmarkFixture) -> None:
     """More unknown rigidities in a basis of 14 coordinates, at 10 m/s."""
     counts = [7, 14, 28, 56]
     windows = [cases.noise_window(elements=n, coordinates=14) for n in counts]
@@ -76,7 +76,7 @@ def test_growth_with_elements(benchmark: BenchmarkFixture):
     _record(benchmark, counts, seconds)
 
 
-def test_growth_with_elements_and_all_modes(benchmark: BenchmarkFixture):
+def test_growth_with_elements_and_all_modes(benchmark: BenchmarkFixture) -> None:
     """More elements with all their 2 n degrees of freedom, at 10 m/s."""
     counts = [4, 7, 14, 28]
     windows = [cases.noise_window(elements=n) for n in counts]
@@ -85,7 +85,7 @@ def test_growth_with_elements_and_all_modes(benchmark: BenchmarkFixture):
     _record(benchmark, counts, seconds)
 
 
-def test_growth_with_particles(benchmark: BenchmarkFixture):
+def test_growth_with_particles(benchmark: BenchmarkFixture) -> None:
     """The paper's crossing for 125 to 2000 particles."""
     counts = [125, 250, 500, 1000, 2000]
     window = cases.noise_window()
@@ -94,7 +94,7 @@ def test_growth_with_particles(benchmark: BenchmarkFixture):
     _record(benchmark, counts, seconds, evaluations=1)
 
 
-def test_parts_of_an_evaluation(benchmark: BenchmarkFixture):
+def test_parts_of_an_evaluation(benchmark: BenchmarkFixture) -> None:
     """What does not grow with the steps, what does, and how much of that each mode costs.
 
     From four evaluations: at 10 and 5 m/s (twice the steps), with 14 and with 7 coordinates.

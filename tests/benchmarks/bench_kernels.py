@@ -16,7 +16,7 @@ from tests.benchmarks import cases, plain_numpy
 BATCH = 500
 
 
-def test_one_evaluation_alone(benchmark: BenchmarkFixture):
+def test_one_evaluation_alone(benchmark: BenchmarkFixture) -> None:
     window = cases.paper_window(cases.SCENARIO)
     work = residual.workspace(window)
     vectors = itertools.cycle(cases.particles(BATCH))
@@ -28,7 +28,7 @@ def test_one_evaluation_alone(benchmark: BenchmarkFixture):
     )
 
 
-def test_one_evaluation_of_500(benchmark: BenchmarkFixture):
+def test_one_evaluation_of_500(benchmark: BenchmarkFixture) -> None:
     window = cases.paper_window(cases.SCENARIO)
     work = residual.workspace(window)
     vectors = cases.particles(BATCH)
@@ -47,7 +47,7 @@ def test_one_evaluation_of_500(benchmark: BenchmarkFixture):
 )
 def test_plain_numpy(
     benchmark: BenchmarkFixture, plain: Callable[[plain_numpy.Prepared, cases.Floats], float]
-):
+) -> None:
     window = cases.paper_window(cases.SCENARIO)
     prepared = plain_numpy.prepare(window, experiment.ELEMENTS, experiment.SPAN_M)
     vectors = itertools.cycle(cases.particles(20))
@@ -59,7 +59,7 @@ def test_plain_numpy(
     )
 
 
-def test_paper_search(benchmark: BenchmarkFixture):
+def test_paper_search(benchmark: BenchmarkFixture) -> None:
     window = cases.paper_window(cases.SCENARIO)
     walk = random_walk.problem(window, cases.NOMINAL, cases.FREE, seed=1)
     random_walk.init(walk, 8)  # compiled, or loaded
@@ -79,7 +79,7 @@ def test_paper_search(benchmark: BenchmarkFixture):
     benchmark.extra_info["worst_accuracy"] = float(mean.min())
 
 
-def test_least_squares(benchmark: BenchmarkFixture):
+def test_least_squares(benchmark: BenchmarkFixture) -> None:
     window = cases.paper_window(cases.SCENARIO)
     problem = least_squares.LeastSquaresProblem(window, cases.NOMINAL, cases.FREE)
     work = residual.workspace(window)
@@ -106,7 +106,7 @@ def test_least_squares(benchmark: BenchmarkFixture):
     }
 
 
-def test_simulation(benchmark: BenchmarkFixture):
+def test_simulation(benchmark: BenchmarkFixture) -> None:
     drive = cases.paper_drive()
     run = benchmark.pedantic(
         simulate,

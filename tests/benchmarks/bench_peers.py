@@ -135,7 +135,7 @@ def _race(peer: Callable[[Batch, int], None], scenario: int, seed: int) -> dict[
 @pytest.mark.parametrize("name", list(_PEERS))
 def test_peer(
     benchmark: BenchmarkFixture, name: str, scenario: int, capfd: pytest.CaptureFixture[str]
-):
+) -> None:
     runs = benchmark.pedantic(
         lambda: [_race(_PEERS[name], scenario, seed) for seed in SEEDS], rounds=1
     )
@@ -144,7 +144,7 @@ def test_peer(
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
-def test_least_squares(benchmark: BenchmarkFixture, scenario: int):
+def test_least_squares(benchmark: BenchmarkFixture, scenario: int) -> None:
     """Ours, one thread, to its own convergence."""
     window = cases.paper_window(scenario)
     problem = least_squares.LeastSquaresProblem(window, cases.NOMINAL, cases.FREE)
@@ -171,7 +171,7 @@ def test_least_squares(benchmark: BenchmarkFixture, scenario: int):
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
-def test_random_walk(benchmark: BenchmarkFixture, scenario: int):
+def test_random_walk(benchmark: BenchmarkFixture, scenario: int) -> None:
     """The paper's search; its answer is the mean of its particles, its best particle is shown."""
     window = cases.paper_window(scenario)
     walk = random_walk.problem(window, cases.NOMINAL, cases.FREE, seed=1)

@@ -188,7 +188,7 @@ def start(role: str, *arguments: str, err: object) -> "subprocess.Popen[str]":
     return subprocess.Popen(
         [sys.executable, "-m", "tests.benchmarks.logger_load", "--role", role, *arguments],
         stdout=subprocess.PIPE,
-        stderr=err,  # type: ignore[arg-type]
+        stderr=err,
         text=True,
         env=os.environ | parent_environment(),
     )
@@ -245,7 +245,7 @@ def log(endpoint: str, folder: Path, rotate_minutes: float) -> int:
                 took_ms = (now_ns - np.fromiter(times, np.int64)) // 1_000_000
                 np.add.at(delays, np.clip(took_ms, 0, _LONGEST_MS - 1), 1)
 
-    writer.DurableStreams = Timed  # type: ignore[misc]
+    writer.DurableStreams = Timed
     code = logger.run(
         LoggerSettings(
             listen=endpoint,

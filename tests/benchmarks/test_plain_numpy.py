@@ -12,7 +12,7 @@ from tests.benchmarks import cases, plain_numpy
 @pytest.mark.parametrize(
     "plain", [plain_numpy.objective, plain_numpy.objective_with_filters], ids=["nodal", "modal"]
 )
-def test_plain_numpy_agrees(plain: Callable[[plain_numpy.Prepared, cases.Floats], float]):
+def test_plain_numpy_agrees(plain: Callable[[plain_numpy.Prepared, cases.Floats], float]) -> None:
     window = cases.paper_window(cases.SCENARIO)
     work = residual.workspace(window)
     prepared = plain_numpy.prepare(window, experiment.ELEMENTS, experiment.SPAN_M)

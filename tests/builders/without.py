@@ -43,7 +43,7 @@ class Refused:
 def main(extras: str, what: str, *arguments: str) -> int:
     refused = Refused([extra for extra in extras.split(",") if extra])
     assert not refused.modules & sys.modules.keys()
-    sys.meta_path.insert(0, refused)  # type: ignore[arg-type]
+    sys.meta_path.insert(0, refused)
     if what == "python":
         exec(arguments[0], {})  # noqa: S102
         return 0

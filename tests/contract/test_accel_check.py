@@ -3,6 +3,7 @@
 import math
 import struct
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from hypothesis import example, given
@@ -19,13 +20,18 @@ LIMIT = signals.MAX_ACCELERATION_M_PER_S2
 def encoded(
     *channels: tuple[int, float, list[float]], names: tuple[str, ...] = (), **header: int
 ) -> bytes:
-    known = {"schema_version": 1, "boot_id": TIME_NS, "sequence": 5, "device_time_ns": 7}
+    known: dict[str, Any] = {
+        "schema_version": 1,
+        "boot_id": TIME_NS,
+        "sequence": 5,
+        "device_time_ns": 7,
+    }
     message = pb.AccelBatch(**{**known, "wall_time_ns": TIME_NS, **header})
     for (position, rate_hz, samples), name in zip(
         channels, names or ("",) * len(channels), strict=True
     ):
         message.channels.add(
-            position=position,  # type: ignore[arg-type]  # also of no known channel
+            position=position,
             rate_hz=rate_hz,
             acceleration_m_per_s2=samples,
             name=name,
@@ -156,7 +162,7 @@ def test_any_header(boot_id: int, sequence: int, device_time_ns: int, wall_time_
         "device_time_ns": device_time_ns,
         "wall_time_ns": wall_time_ns,
     }
-    assert_same(encoded((1, 1000.0, [0.5] * 50), **header))
+    assert_same(encoded((1, 1000.0, [0.5] * 50), names=(), **header))
 
 
 @pytest.mark.parametrize("place", [0, 49, 50, 199])

@@ -241,7 +241,7 @@ def test_impossible_fixes_are_neither_read_nor_written(field: str, value: float)
     with pytest.raises(ValueError, match=field):
         signals.decode_gnss(message.SerializeToString())
     with pytest.raises(ValueError, match=field):
-        signals.encode_gnss(FIX._replace(**{field: value}))
+        signals.encode_gnss(signals.GnssFix(**{**FIX._asdict(), field: value}))
 
 
 def test_unknown_altitude_is_nan_and_never_zero() -> None:

@@ -150,11 +150,12 @@ def modules() -> list[Module]:
 def definitions(node: ast.AST, of: str = "") -> Iterator[tuple[str, ast.AST]]:
     """Yield all classes and functions, also those within others, with their qualified names."""
     for child in ast.iter_child_nodes(node):
-        is_one = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)
-        name = f"{of}{child.name}" if is_one else of
-        if is_one:
+        if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            name = f"{of}{child.name}"
             yield name, child
-        yield from definitions(child, f"{name}." if is_one else of)
+            yield from definitions(child, f"{name}.")
+        else:
+            yield from definitions(child, of)
 
 
 def lines_of(node: ast.AST) -> int:

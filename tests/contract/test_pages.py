@@ -25,7 +25,7 @@ def slug(heading: str) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_somewhere(page: Path):
+def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
         if target.startswith(("http://", "https://")):
             continue
@@ -37,24 +37,24 @@ def test_links_lead_somewhere(page: Path):
             assert anchor in {slug(heading) for heading in headings}, f"no heading for {target}"
 
 
-def test_commands_page_has_every_command():
+def test_commands_page_has_every_command() -> None:
     page = (ROOT / "docs/commands.md").read_text()
     assert len(re.findall(r"^\| `driveby [a-z]+` \|", page, re.MULTILINE)) >= 25
 
 
-def test_example_site_file_is_accepted():
+def test_example_site_file_is_accepted() -> None:
     site = load_site(ROOT / "docs/site.example.toml")
     assert site.bridges[0].elements == 7
 
 
-def test_ci_runs_the_commands_of_the_readme():
+def test_ci_runs_the_commands_of_the_readme() -> None:
     script = ROOT / ".ci/run"
     assert script.stat().st_mode & 0o111
     assert "make test" in script.read_text()
     assert "make test" in (ROOT / "README.md").read_text()
 
 
-def test_tests_that_pages_name_are_there():
+def test_tests_that_pages_name_are_there() -> None:
     paths = [*(ROOT / "tests").glob("**/*.py")]
     tests = {name for path in paths for name in re.findall(r"def (test_\w+)", path.read_text())}
     files = {str(path) for path in paths}
@@ -69,7 +69,7 @@ def test_tests_that_pages_name_are_there():
     assert named > 50, "or it looks in the wrong place"
 
 
-def test_version_is_the_same_everywhere():
+def test_version_is_the_same_everywhere() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     citation = (ROOT / "CITATION.cff").read_text()
     assert f"\nversion: {project['version']}\n" in citation

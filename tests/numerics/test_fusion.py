@@ -334,7 +334,7 @@ def test_runs_over_a_real_road(
     kept = pre_method.optimum.find_optimum
 
     def keeping(*args: object) -> Optimum:
-        runs.append(kept(*args))  # type: ignore[arg-type]
+        runs.append(kept(*args))
         return runs[-1]
 
     monkeypatch.setattr(pre_method.optimum, "find_optimum", keeping)

@@ -157,7 +157,14 @@ class RunningCommand:
 
 def texts_of(address: str, path: Path) -> list[str]:
     """Texts of the bridge that a viewer which comes now receives, one text after the other."""
-    command = [viewer_program(), address, "--save", str(path), "--port", str(free_port())]
+    command: list[str | Path] = [
+        viewer_program(),
+        address,
+        "--save",
+        str(path),
+        "--port",
+        str(free_port()),
+    ]
     path.unlink(missing_ok=True)
     saving = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     texts: list[str] = []

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,9 @@ def test_what_the_readme_says_happens(endpoint: str, project: Path, tmp_path: Pa
         def seen(name: str) -> str:
             return (tmp_path / f"{name}.log").read_text()
 
+        def is_ready(name: str) -> bool:
+            return "ready, " in seen(name)
+
         for _, name, *words in commands:
             where = "--listen" if name == "logger" else "--endpoint"
             line = [sys.executable, "-m", "driveby", name, *words, where, endpoint]
@@ -63,7 +67,7 @@ def test_what_the_readme_says_happens(endpoint: str, project: Path, tmp_path: Pa
                     line, cwd=tmp_path, env=own, stdout=log, stderr=log
                 )
             if name in ("logger", "worker"):
-                until(lambda name=name: "ready, " in seen(name), f"the {name}")
+                until(partial(is_ready, name), f"the {name}")
         assert started["truck"].wait(timeout=LONGEST_S) == 0, seen("truck")
         lowest = r"good, lowest EI_4 0\.4\d\d of nominal \(0\.3\d\d to 0\.4\d\d\)\n"
         until(lambda: re.search(rf"truck-1 → bridge-1: {lowest}", seen("watch")), "the result")

@@ -98,7 +98,8 @@ def test_comma2k19_is_published_recorded_and_replayed(
 
     # The track, for any viewer that knows foxglove.LocationFix.
     with (tmp_path / "driven.mcap").open("rb") as file:
-        schemas = {schema.name for schema, _, _ in make_reader(file).iter_messages()}  # type: ignore[no-untyped-call]
+        found = [schema for schema, _, _ in make_reader(file).iter_messages()]
+        schemas = {schema.name for schema in found if schema is not None}
     assert "foxglove.LocationFix" in schemas
     located = [m.payload for m in driven if m.key.stream == "location"]
     track = [location_class().FromString(payload) for payload in located]

@@ -23,7 +23,7 @@ from services.bus.session import open_session
 from services.bus.subscription import Subscription
 from services.cli.main import main
 from services.drives.ros2_anomalies import DROPPED, TOO_LARGE
-from services.drives.ros2_messages import FIX, IMU
+from services.drives.ros2_messages import FIX, IMU, TWIST
 from services.drives.ros2_truck import Ros2Truck
 from services.drives.signals import Signals, signals_of_recording
 from services.recordings.recording import read_messages
@@ -290,7 +290,7 @@ def test_a_domain_is_its_own_and_humble_has_no_hash(
             place, velocity = ros2.fix(stamp_ns, 50.0, 8.0), ros2.twist(stamp_ns, 3.0, -4.0)
             for topic, of, payload in (
                 (ros2.FIX_TOPIC, FIX, place),
-                (ros2.VELOCITY_TOPIC, ros2.TWIST, velocity),
+                (ros2.VELOCITY_TOPIC, TWIST, velocity),
             ):
                 node.publish(
                     ros2.Ros(topic, of, payload, stamp_ns), type_hash="TypeHashNotSupported"

@@ -67,14 +67,14 @@ def test_it_receives_a_truck_and_prints_its_result(
         assert subscriber.stdout is not None
         expected = {"info", "accel", "gnss", "location", "durable", "estimate"}
         for line in subscriber.stdout:
-            found = re.fullmatch(r"live (truck-1|logger|bridge-1) ([a-z]+)(.*)\n", line)
-            assert found, line
-            expected.discard(found[2])
-            if found[2] == "estimate":
-                assert found[3].count(" EI_") == 7
-                assert " EI_4 5.88e+09 to 6.61e+09 EI_5 " in found[3]
+            shown = re.fullmatch(r"live (truck-1|logger|bridge-1) ([a-z]+)(.*)\n", line)
+            assert shown, line
+            expected.discard(shown[2])
+            if shown[2] == "estimate":
+                assert shown[3].count(" EI_") == 7
+                assert " EI_4 5.88e+09 to 6.61e+09 EI_5 " in shown[3]
             else:
-                assert not found[3]
+                assert not shown[3]
             if not expected:
                 break
         assert not expected

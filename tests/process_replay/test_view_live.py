@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -148,11 +149,11 @@ def test_in_a_browser_until_it_is_closed(endpoint: str, tmp_path: Path) -> None:
             view = subprocess.Popen(command, env=own, stdout=said, stderr=said)
         try:
             until(lambda: re.search(r"in a browser: http://127.0.0.1:\d+\?url=", log.read_text()))
-            until(lambda pid=view.pid: children(pid), "the viewer")
+            until(partial(children, view.pid), "the viewer")
             (viewer,) = children(view.pid)
             os.kill(viewer if end == "viewer" else view.pid, signal.SIGTERM)
             assert view.wait(timeout=LONGEST_S) == 0, log.read_text()
-            until(lambda pid=viewer: not Path(f"/proc/{pid}").exists(), "the viewer's end")
+            until(partial(has_ended, viewer), "the viewer's end")
         finally:
             view.kill()
             view.wait()
@@ -188,6 +189,10 @@ def test_it_is_seen_in_a_browser(
             view.terminate()
             view.wait(timeout=LONGEST_S)
         publisher.close()
+
+
+def has_ended(pid: int) -> bool:
+    return not Path(f"/proc/{pid}").exists()
 
 
 def children(pid: int) -> list[int]:

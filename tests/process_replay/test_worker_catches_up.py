@@ -160,10 +160,11 @@ def test_a_site_file_that_is_edited_while_the_worker_runs(
         drive_by()
         until(lambda: heard(1), "the first result")
         site.write_text("nonsense")
-        assert process.stderr is not None
-        until(lambda: "keeping the previous site file" in process.stderr.readline(), "a warning")
+        log = process.stderr
+        assert log is not None
+        until(lambda: "keeping the previous site file" in log.readline(), "a warning")
         site.write_text(site_toml(edited))
-        until(lambda: "was edited" in process.stderr.readline(), "that it is taken up")
+        until(lambda: "was edited" in log.readline(), "that it is taken up")
         drive_by()
         until(lambda: heard(2), "the second result")
         stop(process)

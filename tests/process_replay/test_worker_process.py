@@ -243,7 +243,7 @@ def test_a_worker_outlives_what_strangers_send(
         # Before the bridge: on it, it would count.
         stranger = [m._replace(key=m.key._replace(identifier="stranger")) for m in drive_on[:half]]
         publish(publisher, stranger)
-        token.undeclare()  # type: ignore[no-untyped-call]
+        token.undeclare()
         publish(publisher, drive_on[half:])
         published = up_to(results, "state")
         publisher.close()
@@ -273,7 +273,7 @@ def test_a_second_truck_does_not_keep_the_first_from_leaving(
         publisher = Publisher(bus, REALM)
         token = bus.liveliness().declare_token(f"driveby/v1/{REALM}/vehicle/truck-1/alive")
         publish(publisher, short)
-        token.undeclare()  # type: ignore[no-untyped-call]
+        token.undeclare()
         estimates: list[RawSample] = []
         deadline = time.monotonic() + LONGEST_S
         stranger = itertools.cycle(

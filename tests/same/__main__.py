@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -80,7 +80,7 @@ def differing(before: str | bytes, after: str | bytes) -> list[str]:
     return [f"byte {first} of {len(old)} and {len(new)} is the first that differs"]
 
 
-def _files(folder: Path) -> Mapping[str, Path]:
+def _files(folder: Path) -> dict[str, Path]:
     paths = (path for path in folder.rglob("*") if path.is_file())
     return {
         name_of(path.relative_to(folder)): path for path in paths if path.suffix not in NOT_COMPARED

@@ -105,10 +105,10 @@ def _mcap(path: Path) -> Iterator[str]:
             schema = schemas.get(channel.schema_id)
             yield f"channel {channel.topic} {channel.message_encoding} {schema}"
         by_key: dict[str, list[str]] = defaultdict(list)
-        for schema, channel, message in reader.iter_messages(log_time_order=False):
+        for of_message, channel, message in reader.iter_messages(log_time_order=False):
             if "/service/" in f"/{channel.topic}":
                 continue  # health and progress follow the clock
-            text = decode(schema.name, message.data) if schema else message.data.hex()
+            text = decode(of_message.name, message.data) if of_message else message.data.hex()
             crossing = re.search(r'crossing_id: ("[^"]*")', text)
             key = f"{channel.topic} {crossing[1] if crossing else ''}"
             times = ""
@@ -138,7 +138,7 @@ def decoder(schemas: list[tuple[str, bytes]]) -> Callable[[str, bytes], str]:
     for name, data in schemas:
         pool = descriptor_pool.DescriptorPool()
         for one in descriptor_pb2.FileDescriptorSet.FromString(data).file:
-            pool.Add(one)  # type: ignore[no-untyped-call]
+            pool.Add(one)
         pools[name] = pool
 
     def text_of(name: str, payload: bytes) -> str:

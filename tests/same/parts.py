@@ -306,8 +306,8 @@ def files(run: Run) -> None:
     run.driveby("fuse", "fuse", "many.json", "--json", "fused.json")
     run.driveby("report", "report", "many.json", "exact.json", *PAPER, "-o", "report.html")
     for kind in ("csv", "parquet"):
-        words = ("export", given("many.mcap"), "many.json", "--to", kind, "--format", kind)
-        run.driveby(f"export-{kind}", *words, "--sensorthings")
+        export = ("export", given("many.mcap"), "many.json", "--to", kind, "--format", kind)
+        run.driveby(f"export-{kind}", *export, "--sensorthings")
     run.driveby("recover", "recover", given("torn.mcap"), "-o", "recovered.mcap", code=3)
     shutil.copytree(run.folder / INPUTS, run.folder / "drives")
     site = ("--site", given("site.toml"), "--csv", "catalog.csv")

@@ -74,7 +74,7 @@ def command(
 
 
 @pytest.mark.parametrize("noise", [0.0, 25.0])
-def test_table_fits_80_columns_with_one_line_for_each_parameter(noise: float):
+def test_table_fits_80_columns_with_one_line_for_each_parameter(noise: float) -> None:
     lines = command(80, (6, 12), noise)
     assert max(len(line) for line in lines) <= 80
     head, *rows = lines[:42]
@@ -87,7 +87,7 @@ def test_table_fits_80_columns_with_one_line_for_each_parameter(noise: float):
     assert not any("…" in line for line in lines)
 
 
-def test_a_walk_that_went_astray_still_fits():
+def test_a_walk_that_went_astray_still_fits() -> None:
     """With the noise of a real sensor the particles take all load off the front axle."""
     found = run(6, particles=8, steps=2, noise=25.0)
     astray = dict.fromkeys(NAMES, 3.52)
@@ -102,19 +102,19 @@ def test_a_walk_that_went_astray_still_fits():
     assert " -1.5 " in next(line for line in lines if " EI_1 " in line)
 
 
-def test_table_shows_truth_and_paper_where_they_belong():
+def test_table_shows_truth_and_paper_where_they_belong() -> None:
     row = next(line.split() for line in command(120, (6,)) if " EI_4 " in line)
     assert row[:7] == ["6", "EI_4", "0.40", "0.54", "±", "0.13", "0.86"]  # Tables 3, 7 and 8
     assert row[-2:] == ["0.4000", "1.0000"]
 
 
-def test_missing_convergence_is_reported():
+def test_missing_convergence_is_reported() -> None:
     lines = command(noise=25.0)
     assert f"scenario 6, ours: {Termination.STEPS_EXHAUSTED.value}" in lines
     assert not any("did not converge" in line for line in command())
 
 
-def test_json_has_the_keys_and_names_of_the_papers_tables(tmp_path: Path):
+def test_json_has_the_keys_and_names_of_the_papers_tables(tmp_path: Path) -> None:
     path = tmp_path / "out.json"
     command(scenarios=(6, 12), json_path=path)
     scenarios = json.loads(path.read_text())["scenarios"]
@@ -135,7 +135,7 @@ def test_json_has_the_keys_and_names_of_the_papers_tables(tmp_path: Path):
         assert min(found["least_squares"]["S_A"].values()) >= 0.999
 
 
-def test_figures_are_written_for_every_scenario(tmp_path: Path):
+def test_figures_are_written_for_every_scenario(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "folder"
     command(scenarios=(6, 12), figures=folder)
     written = {path.name: path.read_bytes()[:8] for path in folder.iterdir()}
@@ -143,7 +143,7 @@ def test_figures_are_written_for_every_scenario(tmp_path: Path):
     assert set(written.values()) == {b"\x89PNG\r\n\x1a\n"}
 
 
-def test_a_site_of_ones_own_is_not_compared_with_the_paper(tmp_path: Path):
+def test_a_site_of_ones_own_is_not_compared_with_the_paper(tmp_path: Path) -> None:
     path = tmp_path / "site.toml"
     path.write_text(site_toml(paper_site()))
     lines = command(site=path)
@@ -152,7 +152,7 @@ def test_a_site_of_ones_own_is_not_compared_with_the_paper(tmp_path: Path):
     assert (row[:3], row[-2:]) == (["6", "EI_4", "0.40"], ["0.4000", "1.0000"])
 
 
-def test_a_damping_of_exactly_zero_is_no_unknown(tmp_path: Path):
+def test_a_damping_of_exactly_zero_is_no_unknown(tmp_path: Path) -> None:
     site = paper_site()
     bridge = site.bridges[0].model_copy(update={"rayleigh_alpha_per_s": 0.0})
     path = tmp_path / "site.toml"
@@ -180,7 +180,9 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return err
 
 
-def test_bad_input_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+def test_bad_input_is_one_line_and_exit_code_2(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     assert '"13"' in refused(capsys, "--scenarios", "6,13")
     assert "does not exist" in refused(capsys, "--json", str(tmp_path / "no" / "out.json"))
     file = tmp_path / "file"
@@ -202,7 +204,7 @@ def test_bad_input_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str
     assert f"{path}: bridge {shorter.id} has 5 elements" in message
 
 
-def test_a_json_that_cannot_be_written_is_bad_input(tmp_path: Path):
+def test_a_json_that_cannot_be_written_is_bad_input(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is a folder"):
         command(json_path=tmp_path)
 
@@ -223,7 +225,7 @@ def clouds_of_paper() -> dict[int, Cloud]:
     }
 
 
-def test_the_paper_agrees_with_itself_and_a_cell_that_is_off_is_counted():
+def test_the_paper_agrees_with_itself_and_a_cell_that_is_off_is_counted() -> None:
     clouds = clouds_of_paper()
     assert compare_with_paper(clouds) == {"cells": 216, "mean": 216, "std": 216}
     clouds[6].mean["EI_4"] += 0.081
@@ -236,7 +238,7 @@ def test_the_paper_agrees_with_itself_and_a_cell_that_is_off_is_counted():
 # The reproduction
 
 
-def test_the_prior_is_the_papers_with_masses_that_follow():
+def test_the_prior_is_the_papers_with_masses_that_follow() -> None:
     found = run(1, particles=200, steps=1)
     prior = dict(zip(found.names, found.prior.T, strict=True))
     assert found.names == NAMES
@@ -248,7 +250,7 @@ def test_the_prior_is_the_papers_with_masses_that_follow():
     assert np.ptp(prior["m_s2"]) > 0.38
 
 
-def test_picture_of_scenarios_6_and_12_in_small():
+def test_picture_of_scenarios_6_and_12_in_small() -> None:
     """The paper's figures 11 and 16c with a fifth of its particles."""
     six, twelve = (run(number, particles=100).random_walk for number in (6, 12))
     assert six.mean["EI_4"] < 0.65  # Table 7: 0.54, truth 0.4
@@ -262,7 +264,7 @@ def test_picture_of_scenarios_6_and_12_in_small():
     assert close["mean"] >= 0.75 * 36
 
 
-def test_a_random_walk_of_few_steps_does_not_reproduce_the_paper():
+def test_a_random_walk_of_few_steps_does_not_reproduce_the_paper() -> None:
     """The counts above must be able to fail: after 20 steps the particles are still spread wide."""
     clouds = {n: run(n, particles=100, steps=20).random_walk for n in (6, 12)}
     assert clouds[6].mean["EI_4"] > 0.65
@@ -271,7 +273,7 @@ def test_a_random_walk_of_few_steps_does_not_reproduce_the_paper():
 
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
-def test_the_paper_in_full():
+def test_the_paper_in_full() -> None:
     found = [run(number) for number in experiment.SCENARIOS]
     close = compare_with_paper({scenario.number: scenario.random_walk for scenario in found})
     assert close["cells"] == 216

@@ -65,7 +65,7 @@ def panel(figure: Figure, symbol: str) -> Axes:
     return next(axes for axes in figure.axes if axes.get_title(loc="right") == symbol)
 
 
-def test_twenty_panels_vehicle_left_bridge_right():
+def test_twenty_panels_vehicle_left_bridge_right() -> None:
     figure = draw_posterior(scenario(1), NAMES)
     assert len(figure.axes) == 20
     middle = {axes.get_title(loc="right"): axes.get_position().x0 for axes in figure.axes}
@@ -73,7 +73,7 @@ def test_twenty_panels_vehicle_left_bridge_right():
     assert {symbol for symbol, x in middle.items() if x > 0.5} == bridge
 
 
-def test_histograms_are_probability_densities_of_what_was_found():
+def test_histograms_are_probability_densities_of_what_was_found() -> None:
     found = scenario(6)
     figure = draw_posterior(found, NAMES)
     axes = panel(figure, "$EI_{4}$")
@@ -91,7 +91,7 @@ def test_histograms_are_probability_densities_of_what_was_found():
     assert len(limits) == 1  # widths can be compared between panels
 
 
-def test_values_beyond_the_axis_are_named():
+def test_values_beyond_the_axis_are_named() -> None:
     found = scenario(1, {"EI_7": 9.8e7, "alpha": -4.0})
     samples = found.random_walk.samples.copy()
     samples[:3, NAMES.index("EI_7")] = 40.0
@@ -105,7 +105,7 @@ def test_values_beyond_the_axis_are_named():
     assert_words_apart(figure)
 
 
-def test_overview_draws_truth_paper_and_both_searches():
+def test_overview_draws_truth_paper_and_both_searches() -> None:
     found = scenario(6, {"EI_4": 0.45, "EI_7": 3.0})
     axes = draw_overview([found], tables_of_paper()).axes[0]
     steps = axes.collections[0].get_paths()
@@ -124,25 +124,25 @@ def test_overview_draws_truth_paper_and_both_searches():
     assert beyond.get_xdata() == pytest.approx([7.25])
 
 
-def test_overview_without_the_paper_does_not_name_it():
+def test_overview_without_the_paper_does_not_name_it() -> None:
     figure = draw_overview([scenario(6)], None)
     assert not any("paper" in text.get_text() for text in words(figure))
     assert len(figure.axes[0].containers) == 1
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 12])
-def test_words_stand_apart_in_the_overview(count: int):
+def test_words_stand_apart_in_the_overview(count: int) -> None:
     assert_words_apart(
         draw_overview([scenario(n) for n in experiment.SCENARIOS[:count]], tables_of_paper())
     )
 
 
 @pytest.mark.parametrize("spread", [0.02, 1.0])
-def test_words_stand_apart_in_the_posterior(spread: float):
+def test_words_stand_apart_in_the_posterior(spread: float) -> None:
     assert_words_apart(draw_posterior(scenario(9, spread=spread), NAMES))
 
 
-def test_fewer_parameters_leave_no_empty_panel():
+def test_fewer_parameters_leave_no_empty_panel() -> None:
     names = tuple(name for name in NAMES if name != "alpha")
     kept = [NAMES.index(name) for name in names]
     found = scenario(1)
@@ -156,7 +156,7 @@ def test_fewer_parameters_leave_no_empty_panel():
     assert len(draw_posterior(found, names).axes) == 19
 
 
-def test_scenarios_are_described_in_words():
+def test_scenarios_are_described_in_words() -> None:
     described = {n: describe(scenario(n)) for n in (1, 3, 6, 8)}
     assert described == {
         1: "sound",
@@ -166,7 +166,7 @@ def test_scenarios_are_described_in_words():
     }
 
 
-def test_png_is_wide_enough_for_a_page_and_the_same_each_time(tmp_path: Path):
+def test_png_is_wide_enough_for_a_page_and_the_same_each_time(tmp_path: Path) -> None:
     one, two, three = (tmp_path / f"{i}.png" for i in range(3))
     posterior_figure(one, scenario(6), NAMES)
     posterior_figure(two, scenario(6), NAMES)

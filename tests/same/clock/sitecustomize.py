@@ -9,5 +9,6 @@ import time
 
 time.perf_counter = lambda: 0.0
 if moment := os.environ.get("DRIVEBY_SAME_CLOCK"):
-    time.time = lambda: float(moment)
-    time.time_ns = lambda: int(moment) * 1_000_000_000
+    now_s = int(moment)
+    time.time = lambda: float(now_s)
+    time.time_ns = lambda: now_s * 1_000_000_000

@@ -83,7 +83,7 @@ def test_every_name_is_there_and_typed_as_what_it_is() -> None:
         assert name in dir(driveby)
     assert driveby.__version__
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        _ = driveby.nothing  # type: ignore[attr-defined]
+        _ = driveby.nothing
 
 
 # -- read

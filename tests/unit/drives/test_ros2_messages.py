@@ -55,7 +55,7 @@ def test_a_fix_has_accuracies_where_its_covariance_is_known() -> None:
     known = decode(FIX, ros2.fix(STAMP_NS, 50.5, 8.25, 90.0, variances=(0.09, 0.25, 1.0)))
     assert known == Fix(STAMP_NS, True, 50.5, 8.25, 90.0, math.sqrt((0.09 + 0.25) / 2), 1.0)
     for covariance in ({"kind": 0}, {"variances": (-1.0, -1.0, math.nan)}):
-        found = decode(FIX, ros2.fix(STAMP_NS, 50.5, 8.25, 90.0, **covariance))  # type: ignore[arg-type]
+        found = decode(FIX, ros2.fix(STAMP_NS, 50.5, 8.25, 90.0, **covariance))
         assert isinstance(found, Fix)
         assert found[5:] == (None, None)
 

@@ -38,7 +38,7 @@ def truck(
     return Ros2Truck(site(text, speed_noise=speed_noise), "site.toml", "truck-1", wrong_rate)
 
 
-def accelerations(of: Ros2Truck, make: Callable[[int], bytes], count: int = 20) -> np.ndarray:  # type: ignore[type-arg]
+def accelerations(of: Ros2Truck, make: Callable[[int], bytes], count: int = 20) -> np.ndarray:
     found: list[Accel | GnssFix] = []
     for number in range(count):
         stamp_ns = FIRST_NS + number * 1_000_000

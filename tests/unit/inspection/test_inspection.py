@@ -151,7 +151,7 @@ def test_clocks(tmp_path: Path) -> None:
             )
             stamped = decode(message.payload)
             wall_ns = stamped.wall_time_ns + offset_ns(stamped.wall_time_ns - start_ns)
-            return message._replace(payload=encode(stamped._replace(wall_time_ns=wall_ns)))  # type: ignore[operator]
+            return message._replace(payload=encode(stamped._replace(wall_time_ns=wall_ns)))
 
         return change
 

@@ -224,11 +224,7 @@ def test_what_no_one_has_is_lost_and_what_was_confirmed_is_not(
             spool.sync()
     gateway.close()
     gateway = Gateway(client, "live", "truck-1", Spool(tmp_path, budget_bytes=MIB))
-    [held] = [
-        boot
-        for boot in gateway._spool.spool.contents("accel")
-        if boot.boot_id == boot_id  # type: ignore[union-attr]
-    ]
+    [held] = [boot for boot in gateway._spool.spool.contents("accel") if boot.boot_id == boot_id]
     logger = Logger(router)
     logger.seen.add(ACCEL, Identity(boot_id, 50))
     present = flat(held.held)
@@ -271,7 +267,7 @@ def test_a_truck_that_does_not_answer_holds_up_no_other(
     logger = Logger(router)
     logger.run(lambda: len(logger.received) == 50)
     gateway.close()
-    mute.undeclare()  # type: ignore[no-untyped-call]
+    mute.undeclare()
 
 
 def test_a_refused_batch_uses_up_no_number(
@@ -332,7 +328,7 @@ def answering(client: zenoh.Session, answer: Callable[[zenoh.Query], None]) -> C
     thread.start()
 
     def end() -> None:
-        queryable.undeclare()  # type: ignore[no-untyped-call]
+        queryable.undeclare()
         thread.join()
 
     return end

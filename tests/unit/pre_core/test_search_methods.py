@@ -130,11 +130,11 @@ def check_pure(init: Callable[[], State], step: Step) -> None:
         first = following
 
 
-def test_a_step_follows_from_the_state_alone(method: Method, window: PaperWindow):
+def test_a_step_follows_from_the_state_alone(method: Method, window: PaperWindow) -> None:
     check_pure(*method.bind(window, 3, 2))
 
 
-def test_a_step_with_a_memory_is_caught(window: PaperWindow):
+def test_a_step_with_a_memory_is_caught(window: PaperWindow) -> None:
     init, step = bind_random_walk(window, 3, 2)
     generator = np.random.default_rng(0)
 
@@ -148,7 +148,7 @@ def test_a_step_with_a_memory_is_caught(window: PaperWindow):
         check_pure(init, remembers)
 
 
-def test_a_step_that_changes_its_argument_is_caught(window: PaperWindow):
+def test_a_step_that_changes_its_argument_is_caught(window: PaperWindow) -> None:
     init, step = bind_random_walk(window, 3, 2)
 
     def scribbles(
@@ -161,7 +161,7 @@ def test_a_step_that_changes_its_argument_is_caught(window: PaperWindow):
         check_pure(init, scribbles)
 
 
-def test_the_seed_decides(method: Method, window: PaperWindow):
+def test_the_seed_decides(method: Method, window: PaperWindow) -> None:
     ends = [
         frozen(loop.run_search(*method.bind(window, seed, 2), method.steps)[0])
         for seed in (5, 5, 6)
@@ -170,7 +170,7 @@ def test_the_seed_decides(method: Method, window: PaperWindow):
     assert ends[0] != ends[2]
 
 
-def test_the_number_of_threads_changes_nothing(method: Method, window: PaperWindow):
+def test_the_number_of_threads_changes_nothing(method: Method, window: PaperWindow) -> None:
     ends = {
         frozen(loop.run_search(*method.bind(window, 5, threads), method.steps)[0])
         for threads in (1, 2, 3)
@@ -178,7 +178,9 @@ def test_the_number_of_threads_changes_nothing(method: Method, window: PaperWind
     assert len(ends) == 1
 
 
-def test_a_stopped_and_resumed_search_is_the_uninterrupted_one(method: Method, window: PaperWindow):
+def test_a_stopped_and_resumed_search_is_the_uninterrupted_one(
+    method: Method, window: PaperWindow
+) -> None:
     init, step = method.bind(window, 2, 2)
     whole, infos, _ = loop.run_search(init, step, 6)
     half, first_infos, _ = loop.run_search(init, step, 2)
@@ -189,7 +191,7 @@ def test_a_stopped_and_resumed_search_is_the_uninterrupted_one(method: Method, w
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_the_objective_never_grows(name: str, window: PaperWindow):
+def test_the_objective_never_grows(name: str, window: PaperWindow) -> None:
     method = METHODS[name]
     init, step = method.bind(window, 7, 2)
     state = init()
@@ -203,14 +205,14 @@ def test_the_objective_never_grows(name: str, window: PaperWindow):
     assert objective[-1] < objective[0]
 
 
-def test_sound_data_end_as_announced(method: Method, window: PaperWindow):
+def test_sound_data_end_as_announced(method: Method, window: PaperWindow) -> None:
     _, infos, ending = loop.run_search(*method.bind(window, 1, 2), method.steps)
     assert ending in method.endings
     assert len(infos) <= method.steps
     assert all(info.ending is None for info in infos[:-1])
 
 
-def test_too_few_steps_are_an_ending_of_their_own(method: Method, window: PaperWindow):
+def test_too_few_steps_are_an_ending_of_their_own(method: Method, window: PaperWindow) -> None:
     init, step = method.bind(window, 1, 2)
     assert loop.run_search(init, step, 1)[2] is Termination.STEPS_EXHAUSTED
     assert (
@@ -222,14 +224,14 @@ def test_too_few_steps_are_an_ending_of_their_own(method: Method, window: PaperW
 @pytest.mark.parametrize("poison", [np.nan, np.inf])
 def test_an_objective_that_is_not_finite_is_an_ending_not_an_exception(
     method: Method, window: PaperWindow, poison: float
-):
+) -> None:
     broken = window._replace(acceleration=np.full_like(window.acceleration, poison))
     _, infos, ending = loop.run_search(*method.bind(broken, 1, 2), method.steps)
     assert ending is Termination.NOT_FINITE
     assert len(infos) == 1
 
 
-def test_progress_is_reported_once_a_step(method: Method, window: PaperWindow):
+def test_progress_is_reported_once_a_step(method: Method, window: PaperWindow) -> None:
     outcome = []
     _, infos, _ = loop.run_search(
         *method.bind(window, 1, 2), 3, progress=lambda count, info: outcome.append((count, info))
@@ -237,13 +239,15 @@ def test_progress_is_reported_once_a_step(method: Method, window: PaperWindow):
     assert outcome == list(enumerate(infos, start=1))
 
 
-def test_every_ending_is_a_sentence():
+def test_every_ending_is_a_sentence() -> None:
     assert all(ending.value.endswith(".") and ending.value[0].isupper() for ending in Termination)
     assert len({ending.value for ending in Termination}) == len(Termination)
 
 
 @pytest.mark.parametrize("differences", [levenberg_marquardt.FORWARD, levenberg_marquardt.CENTRAL])
-def test_every_evaluation_of_a_step_is_counted(differences: levenberg_marquardt.DifferenceScheme):
+def test_every_evaluation_of_a_step_is_counted(
+    differences: levenberg_marquardt.DifferenceScheme,
+) -> None:
     evaluated = []
 
     def rows(y: np.ndarray) -> np.ndarray:
@@ -257,7 +261,7 @@ def test_every_evaluation_of_a_step_is_counted(differences: levenberg_marquardt.
     assert info.evaluations == sum(evaluated)
 
 
-def test_least_squares_ends_with_central_differences(window: PaperWindow):
+def test_least_squares_ends_with_central_differences(window: PaperWindow) -> None:
     """The reference estimate shows what for: tests/process_replay/test_reference.py."""
     init, step = bind_least_squares(window, 3, 1)
     assert init().differences == levenberg_marquardt.FORWARD
@@ -267,7 +271,7 @@ def test_least_squares_ends_with_central_differences(window: PaperWindow):
     assert state.objective <= min(info.objective for info in infos) * (1.0 + 1e-8)
 
 
-def test_slopes_are_of_sixth_order():
+def test_slopes_are_of_sixth_order() -> None:
     """A quicker function stands for a longer step; a polynomial of sixth degree is met exactly."""
     at = np.array([0.3, -0.2])
 
@@ -286,7 +290,7 @@ def test_slopes_are_of_sixth_order():
     np.testing.assert_allclose(sixth, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
 
 
-def test_the_covariance_of_linear_rows_is_that_of_the_textbook():
+def test_the_covariance_of_linear_rows_is_that_of_the_textbook() -> None:
     rng = np.random.default_rng(5)
     matrix = rng.standard_normal((30, 4)) * np.array([1.0, 1e-3, 10.0, 0.1])
     data = rng.standard_normal(30)
@@ -296,7 +300,7 @@ def test_the_covariance_of_linear_rows_is_that_of_the_textbook():
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=0.0)
 
 
-def test_a_kink_leaves_least_squares_stuck():
+def test_a_kink_leaves_least_squares_stuck() -> None:
     state = levenberg_marquardt.initial_state(lambda y: 1.0 + np.abs(y), np.zeros(1))
     assert (
         levenberg_marquardt.descend(lambda y: 1.0 + np.abs(y), state)[1].ending is Termination.STUCK
@@ -319,7 +323,7 @@ def scipys(rows: levenberg_marquardt.Rows, start: np.ndarray, lower: np.ndarray)
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_bounds_against_scipy(seed: int):
+def test_bounds_against_scipy(seed: int) -> None:
     """Exponentials of sums, half of the unknowns bounded at zero: some end there, some do not."""
     rng = np.random.default_rng(seed)
     matrix = rng.standard_normal((14, 6))
@@ -396,7 +400,7 @@ def test_a_point_far_off_is_turned_back_from_without_a_word(is_followed: bool) -
     np.testing.assert_allclose(found.state.y, np.arctanh(0.5), atol=1e-4)
 
 
-def test_at_its_bounds_a_search_ends_at_once():
+def test_at_its_bounds_a_search_ends_at_once() -> None:
     """Held coordinates promise nothing: at the bottom beside them no step is tried."""
     matrix = np.array([[1.0, 0.5], [0.0, 1.0], [1.0, 0.0]])
 
@@ -414,7 +418,7 @@ def test_at_its_bounds_a_search_ends_at_once():
 # The random walk
 
 
-def test_no_particle_of_the_random_walk_ever_climbs(window: PaperWindow):
+def test_no_particle_of_the_random_walk_ever_climbs(window: PaperWindow) -> None:
     init, step = bind_random_walk(window, 9, 2)
     state = init()
     moved = np.zeros(PARTICLES, dtype=bool)
@@ -444,7 +448,7 @@ def test_a_descent_ends_with_the_first_step_that_gains_too_little() -> None:
     assert gains[-1] < 1.0
 
 
-def test_the_random_walk_begins_in_the_papers_prior(window: PaperWindow):
+def test_the_random_walk_begins_in_the_papers_prior(window: PaperWindow) -> None:
     bound = random_walk.problem(window, NOMINAL, FREE, 0)
     ratios = random_walk.init(bound, 2000).ratios
     assert ratios.shape == (2000, 19)
@@ -454,7 +458,7 @@ def test_the_random_walk_begins_in_the_papers_prior(window: PaperWindow):
     assert np.abs(ratios.mean(axis=0) - 1.0).max() < 5 * 0.4 / np.sqrt(12 * 2000)
 
 
-def test_the_particles_objective_is_their_own(window: PaperWindow):
+def test_the_particles_objective_is_their_own(window: PaperWindow) -> None:
     """Early stopping of an evaluation must not leave a wrong J with an accepted particle."""
     init, step = bind_random_walk(window, 4, 2)
     state, _, _ = loop.run_search(init, step, 25)
@@ -464,7 +468,7 @@ def test_the_particles_objective_is_their_own(window: PaperWindow):
     assert np.sum(rows**2, axis=1) == pytest.approx(state.objective, rel=1e-9)
 
 
-def test_impossible_particles_are_never_kept(window: PaperWindow):
+def test_impossible_particles_are_never_kept(window: PaperWindow) -> None:
     """A step as large as the values themselves proposes negative masses all the time."""
     bound = random_walk.problem(window, NOMINAL, FREE, 0, step_ratio=0.5)
     first = random_walk.init(bound, 60)
@@ -498,13 +502,15 @@ def truth_of(scenario: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("scenario", "starts"), [(9, 20), (12, 5)])
-def test_least_squares_finds_everything_from_anywhere_in_the_prior(scenario: int, starts: int):
+def test_least_squares_finds_everything_from_anywhere_in_the_prior(
+    scenario: int, starts: int
+) -> None:
     window = data_of(scenario)
     accuracy = [worst_accuracy(window, truth_of(scenario), seed) for seed in range(starts)]
     assert min(accuracy) >= 0.999
 
 
-def test_wrong_data_and_wrong_truths_are_not_called_found(window: PaperWindow):
+def test_wrong_data_and_wrong_truths_are_not_called_found(window: PaperWindow) -> None:
     """The check above must be able to fail."""
     truth = truth_of(6)
     assert worst_accuracy(window, truth, 0) >= 0.999
@@ -519,7 +525,7 @@ def test_wrong_data_and_wrong_truths_are_not_called_found(window: PaperWindow):
     assert worst_accuracy(heavier, truth, 0) < 0.999
 
 
-def test_derived_masses_follow_from_d_1_and_the_axles(window: PaperWindow):
+def test_derived_masses_follow_from_d_1_and_the_axles(window: PaperWindow) -> None:
     ratios = np.ones((1, FREE.size))
     ratios[0, list(FREE).index(parameters.D_1)] = 1.2
     columns = table_columns(ratios, nominal=NOMINAL, free=FREE, window=window)[0]

@@ -178,7 +178,7 @@ def counted_records(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         @staticmethod
         def unpack_from(*arguments: object) -> tuple[int, int]:
             seen[0] += 1
-            return unpack(*arguments)  # type: ignore[arg-type, return-value]
+            return unpack(*arguments)
 
     monkeypatch.setattr(mcap_scan, "_HEADER", Counting)
     return seen

@@ -364,7 +364,7 @@ def test_too_little_declared_noise_fails_the_validation(
 
     def louder(site: Site, truth: CrossingTruth, seed: int, **others: Any) -> SimulatedCrossing:
         noise = tuple(3.0 * density for density in others["noise_ug_per_rthz"])
-        drawn = drive(site, truth, seed, noise_ug_per_rthz=noise)  # type: ignore[arg-type]
+        drawn = drive(site, truth, seed, noise_ug_per_rthz=noise)
         return drawn._replace(site=SITE)
 
     monkeypatch.setattr(under_test, "drive", louder)

@@ -38,7 +38,7 @@ def simply_supported(x: np.ndarray, load_n: float, at: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("forward", [True, False])
-def test_a_uniform_beam_bends_as_the_textbook_says(forward: bool):
+def test_a_uniform_beam_bends_as_the_textbook_says(forward: bool) -> None:
     found = deflection_frames(view(forward=forward))
     assert found is not None
     sign = 1.0 if forward else -1.0
@@ -56,7 +56,7 @@ def test_a_uniform_beam_bends_as_the_textbook_says(forward: bool):
     assert found.largest_m == pytest.approx(-found.deflection_m.min())
 
 
-def test_it_rests_while_the_truck_is_beside_it():
+def test_it_rests_while_the_truck_is_beside_it() -> None:
     found = deflection_frames(view())
     assert found is not None
     beside = (found.front_m < 0.0) | (found.rear_m > SPAN)
@@ -64,7 +64,7 @@ def test_it_rests_while_the_truck_is_beside_it():
     assert np.abs(found.deflection_m[beside]).max() == 0.0
 
 
-def test_interior_supports_and_bearings_that_give_are_in_it():
+def test_interior_supports_and_bearings_that_give_are_in_it() -> None:
     held = deflection_frames(view(interior_supports_m=(15.0,)))
     assert held is not None
     middle = int(np.argmin(np.abs(held.x_m - 15.0)))
@@ -74,7 +74,7 @@ def test_interior_supports_and_bearings_that_give_are_in_it():
     assert sunk.deflection_m[:, 0].min() == pytest.approx(-1e-9 * 9000.0 * G, rel=0.2)
 
 
-def test_without_a_value_that_it_takes_there_is_none():
+def test_without_a_value_that_it_takes_there_is_none() -> None:
     for name in TRUCK:
         assert deflection_frames(view({k: v for k, v in TRUCK.items() if k != name})) is None
     assert deflection_frames(view(rigidity_nm2=None)) is None

@@ -75,7 +75,7 @@ def labels(axes: Axes) -> set[str]:
     return set() if legend is None else {text.get_text() for text in legend.get_texts()}
 
 
-def test_bars_stand_on_their_elements_with_their_rigidity():
+def test_bars_stand_on_their_elements_with_their_rigidity() -> None:
     edges = np.array([0.0, 3.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0])
     rigidity = draw(view(element_edges_m=edges)).axes[0]
     drawn = bars(rigidity)
@@ -87,7 +87,7 @@ def test_bars_stand_on_their_elements_with_their_rigidity():
         assert bar.get_width() > (right - left) / 2
 
 
-def test_interval_truth_and_nominal_are_drawn_where_they_are():
+def test_interval_truth_and_nominal_are_drawn_where_they_are() -> None:
     rigidity = draw(view()).axes[0]
     whiskers = next(c for c in rigidity.collections if c.get_label() == "95 % interval")
     ends = np.array([path.vertices[:, 1] for path in whiskers.get_paths()])
@@ -98,24 +98,24 @@ def test_interval_truth_and_nominal_are_drawn_where_they_are():
     assert rigidity.get_ylim()[0] == 0.0
 
 
-def test_ratio_axis_agrees_with_the_axis_of_rigidity():
+def test_ratio_axis_agrees_with_the_axis_of_rigidity() -> None:
     figure = draw(view())
     rigidity, ratio = figure.axes[0], figure.axes[-1]
     assert ratio.get_ylabel() == "ratio to nominal"
     assert np.array(rigidity.get_ylim()) == pytest.approx(np.array(ratio.get_ylim()) * 15.6)
 
 
-def test_no_ratio_axis_where_the_elements_have_different_nominal_values():
+def test_no_ratio_axis_where_the_elements_have_different_nominal_values() -> None:
     figure = draw(view(nominal_nm2=np.linspace(10e9, 20e9, 7)))
     assert not any(axes.get_ylabel() == "ratio to nominal" for axes in figure.axes)
 
 
-def test_truth_is_neither_drawn_nor_named_where_there_is_none():
+def test_truth_is_neither_drawn_nor_named_where_there_is_none() -> None:
     figure = draw(view(), truth=False)
     assert all("truth" not in label for axes in figure.axes for label in labels(axes))
 
 
-def test_interval_without_a_noise_model_is_named_as_such():
+def test_interval_without_a_noise_model_is_named_as_such() -> None:
     with_model, without = (
         labels(draw(view(reasons=reasons)).axes[0]) for reasons in ((), ("no_noise_model",))
     )
@@ -124,7 +124,7 @@ def test_interval_without_a_noise_model_is_named_as_such():
     assert "interval (without meaning)" in without
 
 
-def test_rejected_crossing_shows_its_reason_and_no_number():
+def test_rejected_crossing_shows_its_reason_and_no_number() -> None:
     reason = "The truck lacks one of the four accelerometers that the method needs."
     figure = draw(
         view(
@@ -144,7 +144,7 @@ def test_rejected_crossing_shows_its_reason_and_no_number():
     assert not any(text.startswith("$EI") for text in written)
 
 
-def test_differences_are_between_wheels_and_from_the_truth_where_it_is_known():
+def test_differences_are_between_wheels_and_from_the_truth_where_it_is_known() -> None:
     figure = draw(view())
     lines = {line.get_label(): line for line in figure.axes[2].lines}
     assert figure.axes[2].get_ylabel() == "mm"
@@ -158,7 +158,7 @@ def test_differences_are_between_wheels_and_from_the_truth_where_it_is_known():
 @pytest.mark.parametrize(
     ("difference_m", "unit"), [(3e-3, "mm"), (3e-6, "µm"), (3e-9, "nm"), (0.0, "nm")]
 )
-def test_differences_have_a_unit_that_gives_readable_ticks(difference_m: float, unit: str):
+def test_differences_have_a_unit_that_gives_readable_ticks(difference_m: float, unit: str) -> None:
     road = RoadView(X_M, PROFILE_M + difference_m, PROFILE_M)
     assert draw(view(road=road), truth=False).axes[2].get_ylabel() == unit
 
@@ -172,13 +172,13 @@ LONG = {
 
 
 @pytest.mark.parametrize("changes", [{}, {"reasons": ("no_noise_model",)}, LONG])
-def test_all_words_stand_on_the_page_and_apart(changes: dict[str, object]):
+def test_all_words_stand_on_the_page_and_apart(changes: dict[str, object]) -> None:
     figure = draw(view(**changes))
     assert isinstance(figure.canvas, FigureCanvasAgg)
     assert_words_apart(figure)
 
 
-def test_png_is_wide_enough_for_a_page_and_the_same_each_time(tmp_path: Path):
+def test_png_is_wide_enough_for_a_page_and_the_same_each_time(tmp_path: Path) -> None:
     pictures = [tmp_path / "one.png", tmp_path / "two.png"]
     for picture in pictures:
         crossing_figure(picture, crossing=view(), element_truth=None, road_truth=None)
@@ -189,7 +189,7 @@ def test_png_is_wide_enough_for_a_page_and_the_same_each_time(tmp_path: Path):
     assert 1000 < height < width
 
 
-def test_nothing_is_left_behind_where_it_cannot_be_written(tmp_path: Path):
+def test_nothing_is_left_behind_where_it_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
         crossing_figure(
             tmp_path / "no" / "a.png", crossing=view(), element_truth=None, road_truth=None
@@ -197,7 +197,7 @@ def test_nothing_is_left_behind_where_it_cannot_be_written(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_pyplot_and_its_global_state_are_not_touched():
+def test_pyplot_and_its_global_state_are_not_touched() -> None:
     code = "import sys, services.viewer.figure; sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 

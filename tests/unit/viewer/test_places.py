@@ -51,7 +51,7 @@ def positions(rrd: Path, entity: str) -> np.ndarray:
     return np.array(rows)
 
 
-def test_the_plan_of_a_bridge_is_in_its_own_metres(tmp_path: Path, site: Site):
+def test_the_plan_of_a_bridge_is_in_its_own_metres(tmp_path: Path, site: Site) -> None:
     recording, rrd = tmp_path / "run.mcap", tmp_path / "run.rrd"
     write_recording(recording, over_the_bridge(site), site_toml=site_toml(site), reason="test")
     convert(recording, rrd)
@@ -68,7 +68,7 @@ def test_the_plan_of_a_bridge_is_in_its_own_metres(tmp_path: Path, site: Site):
 
 def test_a_crossing_that_nobody_identified_is_shown_and_one_with_a_result_is_not(
     tmp_path: Path, site: Site
-):
+) -> None:
     recording = tmp_path / "run.mcap"
     write_recording(recording, over_the_bridge(site), site_toml=site_toml(site), reason="test")
     found = summarise_recording(recording)
@@ -84,7 +84,7 @@ def test_a_crossing_that_nobody_identified_is_shown_and_one_with_a_result_is_not
     assert "driveby identify run.mcap" in page
 
 
-def test_the_page_names_gaps_and_what_is_not_known(tmp_path: Path):
+def test_the_page_names_gaps_and_what_is_not_known(tmp_path: Path) -> None:
     recording = tmp_path / "run.mcap"
     write_recording(recording, drive(leave_out=range(50, 110)), site_toml=None, reason="test")
     page = recording_page(summarise_recording(recording))
@@ -93,7 +93,7 @@ def test_the_page_names_gaps_and_what_is_not_known(tmp_path: Path):
     assert "No site file in it" in page
 
 
-def test_colours_say_the_ratio_and_doubt_has_none():
+def test_colours_say_the_ratio_and_doubt_has_none() -> None:
     weak, middle, sound, stiff = ratio_colours(np.array([0.3, 0.75, 1.0, 1.4]), 4, doubtful=False)
     assert weak == middle == rgb(WEAK) == rgb(WEAK_BAR)
     assert sound == stiff == (86, 180, 233)
@@ -101,7 +101,9 @@ def test_colours_say_the_ratio_and_doubt_has_none():
     assert ratio_colours(None, 2, doubtful=False) == [(204, 121, 167)] * 2
 
 
-def test_the_map_shows_each_element_with_the_colour_of_what_was_found(tmp_path: Path, site: Site):
+def test_the_map_shows_each_element_with_the_colour_of_what_was_found(
+    tmp_path: Path, site: Site
+) -> None:
     found = results_of(site, some_crossing("a"))
     rrd = tmp_path / "found.rrd"
     write_views(rrd, vehicles={}, crossings=found.crossings, site=site)

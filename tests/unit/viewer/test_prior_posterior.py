@@ -15,7 +15,7 @@ def log_normal(location: float, scale: float) -> Prior:
     return Prior(distribution="log_normal", location=location, scale=scale)
 
 
-def test_an_unknown_of_which_nothing_was_learned_is_as_wide_as_its_prior():
+def test_an_unknown_of_which_nothing_was_learned_is_as_wide_as_its_prior() -> None:
     e = 2.718281828459045
     nothing = row("k_s1", e**-0.2939946, 1.0, e**0.2939946, log_normal(1.0, 0.15))
     (found,) = prior_posterior_rows([nothing])
@@ -24,7 +24,7 @@ def test_an_unknown_of_which_nothing_was_learned_is_as_wide_as_its_prior():
     assert found.share == pytest.approx(1.0, abs=1e-3)
 
 
-def test_a_lost_element_is_as_many_standard_deviations_away_as_its_logarithm():
+def test_a_lost_element_is_as_many_standard_deviations_away_as_its_logarithm() -> None:
     (found,) = prior_posterior_rows([row("EI_4", 0.39, 0.40, 0.41, log_normal(1.0, 0.55))])
     assert found.estimate == pytest.approx(-0.916291 / 0.55, abs=1e-5)
     assert found.share == pytest.approx(0.0232, abs=1e-3)
@@ -45,7 +45,7 @@ def test_each_form_of_a_prior_has_its_scale(form, location, value, expected, lim
     assert found.prior == pytest.approx(limits, abs=1e-3)
 
 
-def test_elements_come_first_and_what_is_derived_is_left_out():
+def test_elements_come_first_and_what_is_derived_is_left_out() -> None:
     rows = [
         row("d_1", 1.0, 1.0, 1.0, log_normal(1.0, 0.1)),
         row("EI_1", 1.0, 1.0, 1.0, log_normal(1.0, 0.5)),
@@ -54,7 +54,7 @@ def test_elements_come_first_and_what_is_derived_is_left_out():
     assert [found.name for found in prior_posterior_rows(rows)] == ["EI_1", "d_1"]
 
 
-def test_what_no_logarithm_has_stays_on_the_picture():
+def test_what_no_logarithm_has_stays_on_the_picture() -> None:
     rows = [row("d_1", -1.0, 0.0, 1e9, log_normal(1.0, 0.1)), row("x", 1, 1, 1, log_normal(1, 0))]
     wild, fixed = prior_posterior_rows(rows)
     assert (wild.low, wild.high) == (-4.5, 4.5)

@@ -307,7 +307,7 @@ def test_bars_begin_and_end_on_their_elements(drive):
     assert widths / np.diff(edges) == pytest.approx(np.full(3, 0.9))
 
 
-def test_rejected_crossing_shows_its_reason_and_no_number(tmp_path: Path, site: Site):
+def test_rejected_crossing_shows_its_reason_and_no_number(tmp_path: Path, site: Site) -> None:
     path = tmp_path / "rejected.rrd"
     vehicles = {"truck-1": VehicleSignals(accel(channels=("sprung_front",)), gnss())}
     write_views(path, vehicles=vehicles, crossings=[rejected()], site=site)
@@ -321,7 +321,7 @@ def test_rejected_crossing_shows_its_reason_and_no_number(tmp_path: Path, site: 
     assert "EI_" not in text
 
 
-def test_table_withholds_intervals_that_mean_nothing(site: Site):
+def test_table_withholds_intervals_that_mean_nothing(site: Site) -> None:
     known = view_of_crossing(crossing(), site.bridges[0])
     unknown = view_of_crossing(
         crossing(verdict="suspect", reasons=["no_noise_model"]), site.bridges[0]
@@ -331,7 +331,7 @@ def test_table_withholds_intervals_that_mean_nothing(site: Site):
     assert "| k_s1 | 4.56e+05 N/m |" in verdict_markdown(known)
 
 
-def test_gap_breaks_the_line():
+def test_gap_breaks_the_line() -> None:
     batches = accel(10)
     del batches[4:6]
     time_ns, samples = acceleration_series(batches)["sprung_rear"]
@@ -343,11 +343,11 @@ def test_gap_breaks_the_line():
     assert len(whole) == 10 * BATCH
 
 
-def test_absent_channels_stay_absent():
+def test_absent_channels_stay_absent() -> None:
     assert set(acceleration_series(accel(3, ("sprung_front",)))) == {"sprung_front"}
 
 
-def test_only_bridges_that_fit_on_the_map_of_the_track_are_on_it(site: Site):
+def test_only_bridges_that_fit_on_the_map_of_the_track_are_on_it(site: Site) -> None:
     (near,) = bridges_of_site(site)
     far = near._replace(identifier="far", start=(37.9, -122.3), end=(37.9, -122.299))
     signals = VehicleSignals([], gnss())
@@ -355,13 +355,13 @@ def test_only_bridges_that_fit_on_the_map_of_the_track_are_on_it(site: Site):
     assert bridges_near_tracks([far, near], [VehicleSignals([], [])]) == [far, near]
 
 
-def test_chainage_falls_when_the_truck_comes_from_the_other_end(site: Site):
+def test_chainage_falls_when_the_truck_comes_from_the_other_end(site: Site) -> None:
     view = view_of_crossing(crossing(direction="end_to_start"), site.bridges[0])
     times = view.entry_time_s + np.array([0.0, 1.0, 3.0])
     assert front_axle_chainage(view, times) == pytest.approx([30.0, 20.0, 0.0], abs=1e-5)
 
 
-def test_strip_is_brightest_at_the_estimate(site: Site):
+def test_strip_is_brightest_at_the_estimate(site: Site) -> None:
     view = view_of_crossing(crossing(), site.bridges[0])
     strip = rigidity_strip(view).astype(int).sum(axis=2)
     assert strip.shape == (STRIP_HEIGHT, STRIP_WIDTH)
@@ -393,7 +393,7 @@ def estimate() -> Message:
     )
 
 
-def test_repeated_and_late_messages_are_drawn_once_and_in_order():
+def test_repeated_and_late_messages_are_drawn_once_and_in_order() -> None:
     mixed = [*messages()[::-1], *messages()[:10]]
     broken = messages()[0]._replace(payload=b"\xff\xff", sequence=999)
     signals = signals_of_messages([broken, *mixed])["truck-1"]
@@ -401,7 +401,7 @@ def test_repeated_and_late_messages_are_drawn_once_and_in_order():
     assert [fix.sequence for fix in signals.gnss] == list(range(20))
 
 
-def test_recording_with_its_results_becomes_a_rerun_file(tmp_path: Path, site: Site):
+def test_recording_with_its_results_becomes_a_rerun_file(tmp_path: Path, site: Site) -> None:
     recording, rrd = tmp_path / "run.mcap", tmp_path / "run.rrd"
     write_recording(recording, [*messages(), estimate()], site_toml=SITE_TOML, reason="test")
     convert(recording, rrd)
@@ -410,7 +410,7 @@ def test_recording_with_its_results_becomes_a_rerun_file(tmp_path: Path, site: S
     assert {f"{root}/rigidity", f"{root}/verdict", "map/position/truck-1"} <= found
 
 
-def test_results_are_drawn_with_the_site_of_the_recording_beside_them(tmp_path: Path):
+def test_results_are_drawn_with_the_site_of_the_recording_beside_them(tmp_path: Path) -> None:
     file = tmp_path / "run.json"
     header = ResultHeader("0", START_NS / 1e9, "0" * 16, {}, 0)
     file.write_text(results_json(results(header, [crossing()], {})))
@@ -424,7 +424,7 @@ def test_results_are_drawn_with_the_site_of_the_recording_beside_them(tmp_path: 
 
 
 @pytest.mark.parametrize("name", ["missing.rrd", "missing.mcap", "notes.txt"])
-def test_what_cannot_be_opened_is_bad_input(tmp_path: Path, name: str):
+def test_what_cannot_be_opened_is_bad_input(tmp_path: Path, name: str) -> None:
     from rich.console import Console
 
     (tmp_path / "notes.txt").write_text("no recording")
@@ -433,7 +433,7 @@ def test_what_cannot_be_opened_is_bad_input(tmp_path: Path, name: str):
 
 
 @pytest.mark.parametrize("web", [False, True])
-def test_viewer_listens_on_loopback_only(web: bool):
+def test_viewer_listens_on_loopback_only(web: bool) -> None:
     arguments = viewer_arguments(Path("a.rrd"), web=web)
     assert arguments[arguments.index("--bind") + 1] == "127.0.0.1"
     assert ("--web-viewer" in arguments) == web
@@ -455,7 +455,9 @@ subprocess.Popen = told_to_stop_meanwhile
 
 @pytest.mark.process
 @pytest.mark.parametrize("while_it_starts", [False, True])
-def test_viewer_ends_with_the_command_that_started_it(tmp_path: Path, while_it_starts: bool):
+def test_viewer_ends_with_the_command_that_started_it(
+    tmp_path: Path, while_it_starts: bool
+) -> None:
     """A stand-in for the viewer: the real one needs a screen."""
     started = tmp_path / "started"
     program = tmp_path / "viewer"
@@ -492,7 +494,7 @@ def coloured(picture: np.ndarray) -> int:
 
 
 @pytest.mark.process
-def test_recording_opened_directly_is_drawn_on_a_map(tmp_path: Path):
+def test_recording_opened_directly_is_drawn_on_a_map(tmp_path: Path) -> None:
     """By Rerun itself, from what the recording says of its messages."""
     recording = tmp_path / "run.mcap"
     write_recording(recording, messages(), site_toml=None, reason="test")
@@ -503,7 +505,7 @@ def test_recording_opened_directly_is_drawn_on_a_map(tmp_path: Path):
 
 
 @pytest.mark.process
-def test_rerun_file_has_its_layout_and_draws_without_complaint(tmp_path: Path, site: Site):
+def test_rerun_file_has_its_layout_and_draws_without_complaint(tmp_path: Path, site: Site) -> None:
     path = tmp_path / "drive.rrd"
     vehicles = {"truck-1": VehicleSignals(accel(), gnss())}
     write_views(path, vehicles=vehicles, crossings=[crossing()], site=site)
@@ -522,7 +524,7 @@ def test_rerun_file_has_its_layout_and_draws_without_complaint(tmp_path: Path, s
 
 
 @pytest.mark.process
-def test_a_recording_is_shown_with_its_channels_places_and_crossings(tmp_path: Path):
+def test_a_recording_is_shown_with_its_channels_places_and_crossings(tmp_path: Path) -> None:
     recording, rrd = tmp_path / "run.mcap", tmp_path / "run.rrd"
     write_recording(recording, messages(), site_toml=SITE_TOML, reason="test")
     convert(recording, rrd)
@@ -544,7 +546,7 @@ def test_a_recording_is_shown_with_its_channels_places_and_crossings(tmp_path: P
 
 def test_a_long_drive_is_sent_in_pieces_with_every_sample_and_gap(
     tmp_path: Path, site: Site, monkeypatch: pytest.MonkeyPatch
-):
+) -> None:
     batches = accel(40)
     del batches[19:21]  # a gap between two pieces, and one inside
     del batches[5]
