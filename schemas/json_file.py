@@ -1,5 +1,7 @@
 """JSON files as models, with one line for each error."""
 
+import json
+import re
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,8 +14,10 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 def load_json(model: type[ModelT], path: Path, what: str) -> ModelT:
     """Read a file as `what` ("a results file"); raise InputError in one line if it is not one."""
+    content = b""
     try:
-        return model.model_validate_json(path.read_bytes())
+        content = path.read_bytes()
+        return model.model_validate_json(content)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file, {what} (JSON) is expected") from error
     except OSError as error:
@@ -22,4 +26,23 @@ def load_json(model: type[ModelT], path: Path, what: str) -> ModelT:
         problem = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in problem["loc"])
         message = problem["msg"].removeprefix("Value error, ")
+        message += _remark_of_newer(content)
         raise InputError(f"{path}: {place or f'not {what}'}: {message}") from error
+
+
+def _remark_of_newer(content: bytes) -> str:
+    """Return a remark if the file declares a newer program than this one as its writer."""
+    from importlib import metadata  # 20 ms that only errors need
+
+    try:
+        declared = json.loads(content)
+        theirs = declared["version"] if declared["program"] == "driveby" else ""
+        ours = metadata.version("driveby")
+        is_newer = _numbers(theirs) > _numbers(ours)
+    except (ValueError, KeyError, TypeError, metadata.PackageNotFoundError):
+        return ""
+    return f" (written by driveby {theirs[:20]}, this is {ours})" if is_newer else ""
+
+
+def _numbers(version: str) -> list[int]:
+    return [int(number) for number in re.findall(r"\d{1,9}", version)]

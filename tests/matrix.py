@@ -1,12 +1,16 @@
 """The wheel on several Pythons, with the lowest and the newest versions of what it depends on.
 
-    python -m tests.matrix WHEEL --python python3.11 --python python3.13 [--lowest] [-o DIR]
+    python -m tests.matrix WHEEL --python python3.11 --python python3.13 [--versions newest lowest]
+
+`make matrix` builds the wheel and runs it with every Python that it finds. The interpreter that
+runs this module needs setuptools and nothing else, so that a container of another distribution
+can run it, too (CONTRIBUTING.md).
 
 For each Python an empty environment gets the wheel with all extras and the tests' own packages.
 Then `driveby demo` runs in it, and a selection of the tests, copied to a folder in which the
 project's sources are not: they are rewritten as the wheel's modules are (setup.py), because
-`services` is called `driveby.services` there. `--lowest` adds an environment of the first Python
-with the lowest versions that pyproject.toml allows. The exit code is 1 if anything failed.
+`services` is called `driveby.services` there. `lowest` are the lowest versions that pyproject.toml
+allows of the packages that it names. The exit code is 1 if anything failed.
 """
 
 import argparse
@@ -24,6 +28,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+VERSIONS = ("newest", "lowest")
 RUNNERS = ("hypothesis", "pytest", "pytest-benchmark", "pytest-timeout", "pytest-xdist")
 """Packages that run the tests; the newest in every environment."""
 NEEDED_BY_TESTS = ("jsonschema", "pyyaml")
@@ -74,16 +79,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("wheel", type=Path)
     parser.add_argument("--python", action="append", default=[], help="default: this one")
-    parser.add_argument("--lowest", action="store_true", help="lowest allowed versions as well")
+    parser.add_argument("--versions", nargs="+", choices=VERSIONS, default=["newest"])
     parser.add_argument("-o", "--out", type=Path, default=Path("build/matrix"))
+    parser.add_argument("--again", action="store_true", help="use environments that are there")
     parser.add_argument("-k", default="", help="only the selected tests that match, as in pytest")
     options = parser.parse_args()
     pythons = options.python or [sys.executable]
-    wanted = [Environment(f"newest-{n}", python, False) for n, python in enumerate(pythons)]
-    wanted += [Environment("lowest", pythons[0], True)] if options.lowest else []
+    wanted = [
+        Environment(f"{versions}-{number}", python, versions == "lowest")
+        for versions in options.versions
+        for number, python in enumerate(pythons)
+    ]
     outcomes = []
     for one in wanted:
-        outcomes.append(tried(one, options.wheel.resolve(), options.out.resolve(), options.k))
+        folder = options.out.resolve() / one.name
+        is_there = options.again and (folder / "venv").is_dir()
+        if not is_there:
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+        outcomes.append(tried(one, options.wheel.resolve(), folder, options.k, is_there))
         print(row(outcomes[-1]), flush=True)
     print("\n| Python | versions | `driveby demo` | tests |\n| --- | --- | --- | --- |")
     for outcome in outcomes:
@@ -107,11 +121,8 @@ def lowest() -> Iterator[str]:
             yield f"{found[1]}=={found[2]}"
 
 
-def tried(one: Environment, wheel: Path, out: Path, matching: str) -> Outcome:
+def tried(one: Environment, wheel: Path, folder: Path, matching: str, is_there: bool) -> Outcome:
     """Install the wheel into an empty environment, and run demo and tests in it."""
-    folder = out / one.name
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
     python = folder / "venv" / "bin" / "python"
     variables = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
     variables["NUMBA_CACHE_DIR"] = str(folder / "kernels")
@@ -122,7 +133,7 @@ def tried(one: Environment, wheel: Path, out: Path, matching: str) -> Outcome:
             done = subprocess.run(command, stdout=log, stderr=log, cwd=cwd, env=variables)
             return done.returncode, time.monotonic() - began_s
 
-        if run(one.python, "-m", "venv", folder / "venv")[0]:
+        if not is_there and run(one.python, "-m", "venv", folder / "venv")[0]:
             return Outcome(one, one.python, "", "no environment", False)
         version = subprocess.run(
             [python, "--version"], capture_output=True, text=True, check=True
@@ -130,24 +141,16 @@ def tried(one: Environment, wheel: Path, out: Path, matching: str) -> Outcome:
         bounds = folder / "lowest.txt"
         bounds.write_text("\n".join(lowest()) if one.is_lowest else "")
         install: list[str | Path] = [python, "-m", "pip", "install", "--quiet", "-c", bounds]
-        code, _ = run(*install, f"{wheel}[all]", *RUNNERS, *NEEDED_BY_TESTS)
-        if code:
+        install += [f"{wheel}[all]", *RUNNERS, *NEEDED_BY_TESTS]
+        if not is_there and run(*install)[0]:
             return Outcome(one, version, "", f"cannot be installed: {folder / 'log.txt'}", False)
+        run(python, "-m", "pip", "freeze")  # into the log
         checkout = folder / "tests-only"
+        shutil.rmtree(checkout, ignore_errors=True)
         copied(checkout)
         demo, demo_s = run(python.with_name("driveby"), "demo", cwd=folder)
-        command: list[str | Path] = [
-            python,
-            "-m",
-            "pytest",
-            "-n",
-            "2",
-            "--dist",
-            "loadgroup",
-            "-q",
-            *SELECTION,
-        ]
-        command += [f"--deselect={name}" for name in READS_SOURCES]
+        command: list[str | Path] = [python, "-m", "pytest", "-n", "2", "--dist", "loadgroup", "-q"]
+        command += [*SELECTION, *(f"--deselect={name}" for name in READS_SOURCES)]
         code, _ = run(*command, *(["-k", matching] if matching else []), cwd=checkout)
     last = (folder / "log.txt").read_text().strip().splitlines()[-1].strip("= ")
     said = f"{'runs' if demo == 0 else f'exit code {demo}'} ({demo_s:.0f} s)"

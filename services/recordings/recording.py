@@ -274,7 +274,19 @@ def _scan(
                 if item.id not in channels:
                     channels[item.id] = our_channel(path, item, warn)
             elif isinstance(item, (Metadata, Attachment, Damage)):
+                if isinstance(item, Metadata) and item.name == ABOUT:
+                    _check_format(path, item.metadata, warn)
                 yield item
+
+
+def _check_format(path: Path, about: Mapping[str, str], warn: Warn) -> None:
+    """Warn of a recording in a format that this program does not know."""
+    if (theirs := about.get("format", FORMAT)) != FORMAT:
+        writer = f"driveby {about.get('version', 'of an unknown version')}"
+        warn(
+            f"{path}: is in format {theirs:.20} of {writer:.40}, this program knows format "
+            f"{FORMAT} and may misread it"
+        )
 
 
 def watched(items: Iterator[Item], file: BinaryIO, progress: Offset) -> Iterator[Item]:

@@ -12,6 +12,7 @@ confirmed them, and which were dropped for space. It is replaced before a segmen
 that every message is always accounted for.
 """
 
+import contextlib
 import fcntl
 import json
 import logging
@@ -29,8 +30,6 @@ from schemas.spool import PAGE_BYTES, PAGE_MESSAGES, SpoolBoot
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable, write_atomically
 from services.common.intervals import Intervals
-
-__all__ = ["DEFAULT_BUDGET_BYTES", "Page", "Spool", "SpooledMessage"]
 
 DEFAULT_BUDGET_BYTES = 4 << 30
 """Default size, more than a day of four channels at 1 kHz."""
@@ -85,14 +84,11 @@ class Spool:
         self._segment_bytes = min(_LARGEST_SEGMENT_BYTES, budget_bytes // _SEGMENTS_IN_BUDGET)
         self._lock = threading.Lock()
         self._lock_file = _locked(folder)
-        try:
+        with _closed_on_error(self._lock_file, folder):
             highest, self._past = _read_state(folder / _STATE)
             self._segments = [
                 segment for path in sorted(folder.glob("*.spool")) if (segment := self._load(path))
             ]
-        except OSError as error:
-            os.close(self._lock_file)
-            raise FailureError(f"{folder}: cannot be read: {error.strerror}") from None
         boots = [highest, *(segment.boot_id for segment in self._segments)]
         self.boot_id = max(time.time_ns(), max(boots) + 1)
         """Higher than any before, also where the wall clock went back in between."""
@@ -308,7 +304,7 @@ class Spool:
     def _load(self, path: Path) -> "_Segment | None":
         """Read a segment of an earlier boot and remove its torn end; None if nothing is left."""
         content = _read_file(path, path.stat().st_size)
-        boot_id = _boot_of(content)
+        boot_id = _boot_of(path, content)
         if boot_id is None:
             self.torn_bytes += len(content)
             _log.warning("%s: not a segment of a spool, removed (%d bytes)", path, len(content))
@@ -373,12 +369,15 @@ def _boot(boot_id: int) -> bytes:
     return boot_id.to_bytes(8, "big")
 
 
-def _boot_of(content: bytes) -> int | None:
+def _boot_of(path: Path, content: bytes) -> int | None:
+    """Return the boot of a segment; raise InputError if its format is another program's."""
     if len(content) < _HEADER.size:
         return None
     magic, boot_id, crc = _HEADER.unpack_from(content)
-    if magic != _MAGIC or zlib.crc32(magic + _boot(boot_id)) != crc:
+    if zlib.crc32(magic + _boot(boot_id)) != crc or magic[:7] != _MAGIC[:7]:
         return None
+    if magic != _MAGIC:
+        raise InputError(f"{path}: is of spool format {magic!r}, this program knows {_MAGIC!r}")
     return int(boot_id)
 
 
@@ -405,6 +404,17 @@ def _locked(folder: Path) -> int:
             f"{folder}: another truck uses this spool; give every truck a folder of its own"
         ) from None
     return file
+
+
+@contextlib.contextmanager
+def _closed_on_error(file: int, folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except BaseException as error:
+        os.close(file)
+        if isinstance(error, OSError):
+            raise FailureError(f"{folder}: cannot be read: {error.strerror}") from None
+        raise
 
 
 def _read_state(path: Path) -> tuple[int, dict[tuple[str, int], _BootTotals]]:

@@ -39,7 +39,7 @@ LONG_MODULES = {
 LONG_CLASSES = {
     "services.execution.cluster:DaskExecutor": 273,
     "services.logger.writer:FileWriter": 395,
-    "services.truck.spool:Spool": 260,
+    "services.truck.spool:Spool": 257,
 }
 
 LONG_FUNCTIONS = {
