@@ -6,7 +6,7 @@ PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo up down test test-all faults soak day year mutants validate lint tables docs dist bench lock clean
+.PHONY: help install demo up down test test-all faults soak day year mutants validate lint tables docs dist matrix coverage bench lock clean
 
 help: ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -93,6 +93,20 @@ dist: $(STAMP) ## wheel and source archive of the commit, in build/dist; the sam
 	git archive HEAD | tar -x -C build/source
 	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(BIN)/python docs/scripts/distribution.py build/source build/dist
 	rm -rf build/source
+
+PYTHONS ?= $(shell for v in 3.11 3.12 3.13 3.14; do command -v python$$v; done)
+matrix: dist ## the wheel and a selection of tests on every Python found, newest and lowest versions
+	$(BIN)/python -m tests.matrix build/dist/*.whl $(PYTHONS:%=--python %) --versions newest lowest
+
+# Compiled kernels are invisible to coverage.py; tests of their formulas run them as Python.
+INTERPRETED := tests/numerics/test_beam.py tests/numerics/test_lines.py tests/numerics/test_pre_sinc.py tests/numerics/test_splines.py tests/numerics/test_vehicle.py
+coverage: $(STAMP) ## branch coverage of the default tests, into studies/coverage.md (half an hour)
+	rm -rf build/coverage
+	$(BIN)/coverage run -m pytest $(BESIDE)
+	NUMBA_DISABLE_JIT=1 $(BIN)/coverage run -m pytest $(INTERPRETED)
+	$(BIN)/coverage combine --quiet
+	$(BIN)/coverage json --quiet
+	$(BIN)/python -m tests.coverage_page build/coverage/coverage.json studies/coverage.md
 
 bench: $(STAMP) ## time everything, with its peers, into studies/benchmarks.md (12 minutes)
 	$(BIN)/python -m tests.benchmarks.report
