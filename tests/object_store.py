@@ -1,4 +1,7 @@
-"""An object store on this machine that talks as S3 does."""
+"""An object store on this machine that talks as S3 does.
+
+Tests that use it are marked `xdist_group("object store")`: one worker imports moto, not two.
+"""
 
 import json
 import logging

@@ -19,7 +19,7 @@ from services.truck.spool import Spool
 FOLDERS = sorted(
     path for path in (Path(__file__).parents[1] / "data" / "corpus").iterdir() if path.is_dir()
 )
-MOST_BYTES = 50_000
+MOST_BYTES = 40_000
 
 
 def commit(folder: Path) -> str:

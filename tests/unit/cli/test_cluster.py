@@ -167,6 +167,7 @@ def test_unwritable_output_is_refused_at_the_beginning(
     assert [path.name for path in into.iterdir()] == [BRIDGES]
 
 
+@pytest.mark.xdist_group("object store")
 def test_recordings_in_an_object_store_give_what_they_give_here(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,6 +212,7 @@ def test_recordings_in_an_object_store_give_what_they_give_here(
     assert one_from_there == alone
 
 
+@pytest.mark.xdist_group("object store")
 def test_bucket_that_may_only_be_read_is_identified(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -240,6 +242,7 @@ def test_bucket_that_may_only_be_read_is_identified(
     assert one["crossings"] == whole["crossings"][:1]
 
 
+@pytest.mark.xdist_group("object store")
 def test_wrong_keys_of_a_store_are_one_line(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
