@@ -178,10 +178,8 @@ def test_what_is_there_is_not_missing() -> None:
 # Commands with their extras and no others
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a recording, results beside the drive that they come from, and a history."""
-    folder = tmp_path_factory.mktemp("files")
+def write_files(folder: Path) -> Path:
+    """Write a recording, results beside the drive that they come from, and a history."""
     (folder / "recordings").mkdir()
     shutil.copy(SAMPLE, folder / "recordings" / "crossing.mcap")
     (before, *_) = sorted((ROOT / "tests" / "data" / "before").iterdir())
@@ -191,6 +189,11 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(before / "drive.mcap", folder / "drive.mcap")
     shutil.copytree(before / "history", folder / "history")
     return folder
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_files(tmp_path_factory.mktemp("files"))
 
 
 def run(extras: str, *words: str, code: int = 0) -> str:

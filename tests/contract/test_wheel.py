@@ -17,7 +17,8 @@ from typing import Any
 
 import pytest
 
-INNER = ("pre_core", "schemas", "services")
+from tests.builders.wheels import INNER, sources
+
 LARGEST_TRUCK_MB = 120.0
 """Site-packages of a truck's computer, without compiled bytecode."""
 DECOY = "raise RuntimeError('the package of somebody else was imported')\n"
@@ -26,26 +27,6 @@ DECOY = "raise RuntimeError('the package of somebody else was imported')\n"
 @pytest.fixture(scope="module")
 def built() -> dict[str, Any]:
     return runpy.run_path(str(Path(__file__).parents[2] / "setup.py"), run_name="setup")
-
-
-def sources(project: Path, folder: Path) -> Path:
-    """Return the folder after copying into it what a distribution is built from, and studies."""
-    for name in ("driveby", "studies", *INNER):
-        ignored = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(project / name, folder / name, ignore=ignored)
-    for name in ("setup.py", "pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(project / name, folder / name)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def wheel(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    source = sources(project, tmp_path_factory.mktemp("source"))
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-index"]
-    command += ["--no-build-isolation", "--wheel-dir", str(source / "dist"), str(source)]
-    subprocess.run(command, check=True, capture_output=True)
-    (found,) = (source / "dist").glob("*.whl")
-    return found
 
 
 @pytest.fixture(scope="module")
