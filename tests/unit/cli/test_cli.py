@@ -585,7 +585,12 @@ def test_logger_records_the_chosen_realms(
 ) -> None:
     """And only live without: what appears in other realms is nobody's drive."""
     asked: list[LoggerSettings] = []
-    monkeypatch.setattr("services.logger.run.run", lambda one, ready: asked.append(one) or 0)
+
+    def run(settings: LoggerSettings, ready: object) -> int:
+        asked.append(settings)
+        return 0
+
+    monkeypatch.setattr("services.logger.run.run", run)
     assert cli.main(["logger", *given]) == 0
     assert [one.realms for one in asked] == [realms]
 
