@@ -52,6 +52,7 @@ SELECTION = (
 READS_SOURCES = (
     "tests/contract/test_decoders.py::test_importing_signals_is_cheap",
     "tests/unit/schemas/test_toml_text.py::test_only_one_place_parses_toml",
+    "tests/unit/common/test_child_process.py",
 )
 """Tests that need the sources as they lie in a checkout."""
 COPIED = ("docs", "pyproject.toml", "recordings/sample", "tests")
