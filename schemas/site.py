@@ -18,6 +18,7 @@ from pydantic import (
     model_validator,
 )
 
+from schemas.site_damping import Damping, with_coefficients
 from schemas.site_errors import error_at
 from schemas.site_import import Import
 from schemas.site_lane import Lane
@@ -64,7 +65,7 @@ Rates = Annotated[tuple[Rate, Rate, Rate, Rate], BeforeValidator(_per_channel)]
 Densities = Annotated[tuple[Density, Density, Density, Density], BeforeValidator(_per_channel)]
 
 
-class Bridge(Lane, WithSpreads):
+class Bridge(Lane, Damping, WithSpreads):
     """A bridge of one or more spans. Its ends are at the bearings; elements count from its start.
 
     Over interior supports the beam is continuous: no deflection, free rotation.
@@ -74,7 +75,9 @@ class Bridge(Lane, WithSpreads):
     values by element are the nominal ones and the single value is not used.
     """
 
-    later_keys: ClassVar[tuple[str, ...]] = tuple(Lane.model_fields)
+    later_keys: ClassVar[tuple[str, ...]] = (*Lane.model_fields, *Damping.model_fields)
+
+    _damping = model_validator(mode="before")(with_coefficients)
 
     span_m: Annotated[Number, Field(gt=0, le=1000)]
     start_latitude_deg: Latitude
@@ -234,10 +237,28 @@ class Bridge(Lane, WithSpreads):
             raise error_at(
                 "span_m",
                 f"is {self.span_m:g} but the ends are {distance:.1f} m apart, "
-                "the span and the coordinates of the bearings must agree",
+                "the span and the coordinates of the bearings must agree"
+                f"{self._ends_meant()}",
             )
         check_bridge(self)
         return self
+
+    def _ends_meant(self) -> str:
+        """Return a hint what the coordinates of the ends may be; empty where it is not known."""
+        ends = (
+            (self.start_latitude_deg, self.start_longitude_deg),
+            (self.end_latitude_deg, self.end_longitude_deg),
+        )
+        for hint, (start, end) in {
+            "latitude and longitude exchanged": tuple((b, a) for a, b in ends),
+            "in radians": tuple((math.degrees(a), math.degrees(b)) for a, b in ends),
+            "the sign of one longitude": (ends[0], (ends[1][0], -ends[1][1])),
+        }.items():
+            if abs(start[0]) > 89.0 or abs(end[0]) > 89.0:
+                continue
+            if abs(self.span_m / _distance_m(*start, *end) - 1) <= MAX_SPAN_DISAGREEMENT:
+                return f"; {hint}?"
+        return ""
 
     def _supports_fit(self) -> None:
         """Raise if interior supports do not ascend between the ends or a span has no element."""

@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import re
 from collections.abc import Iterator
 from typing import Any, Final
 
@@ -32,6 +33,8 @@ _QUANTITIES: Final = (
     ("_ug_per_rthz", "a noise density", "µg/√Hz"),
     ("_m_per_s", "a speed", "m/s"),
     ("_per_s", "a coefficient", "1/s"),
+    ("damping_ratio", "a damping ratio", ""),
+    ("first_frequency_hz", "a frequency", "Hz"),
     ("_nm2", "a flexural rigidity", "N·m²"),
     ("_offset_m_spread", "a standard deviation", "m"),
     ("_spread", "a relative standard deviation", ""),
@@ -61,7 +64,14 @@ def all_lines(error: ValidationError, single: set[str], tables: Tables) -> list[
     problems = sorted(error.errors(include_url=False), key=lambda p: order.get(p["type"], 1))
     first, *others = problems
     shown = [first, *(p for p in others if p["type"] != "too_short")]
-    return [_describe(problem, single, tables) for problem in shown]
+    lines = [_describe(problem, single, tables) for problem in shown]
+    # A number that stands for a whole list is wrong once for each of its entries.
+    without = [re.sub(r"\[\d+\](?= is )", "", line, count=1) for line in lines]
+    return [
+        line if without.count(plain) == 1 else plain
+        for k, (line, plain) in enumerate(zip(lines, without, strict=True))
+        if without.count(plain) == 1 or plain not in without[:k]
+    ]
 
 
 def _describe(problem: Any, single: set[str], tables: Tables) -> str:
@@ -86,7 +96,31 @@ def _describe(problem: Any, single: set[str], tables: Tables) -> str:
         return f"{path} has {entries}, it must be {_TABLE_LISTS[_list_key(location)]}"
     return (
         f"{path} is {_shown(value)}, it must be {_expected(problem, _list_key(location), tables)}"
+        f"{_meant(value, _list_key(location), problem['type'])}"
     )
+
+
+_USUAL_M: Final = {
+    "span_m": (3.0, 200.0), "wheelbase_m": (1.5, 12.0), "front_axle_to_cg_m": (0.3, 10.0),
+    "gps_antenna_to_front_axle_m": (0.1, 20.0), "cg_height_m": (0.5, 3.0), "track_m": (1.0, 3.0),
+}  # fmt: skip
+"""Usual lengths, by which a value in cm or mm is recognised."""
+
+
+def _meant(value: object, key: str, kind: str) -> str:
+    """Return a hint in which unit a number beyond its bound may be; empty if none is likely."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return ""
+    if kind == "less_than_equal" and key in _USUAL_M:
+        low, high = _USUAL_M[key]
+        for unit, factor in (("cm", 1e-2), ("mm", 1e-3)):
+            if low <= value * factor <= high:
+                return f"; in {unit}? then it is {value * factor:g}"
+    if kind == "less_than_equal" and key.endswith("_latitude_deg") and value <= 180.0:
+        return "; a longitude?"
+    if kind == "greater_than_equal" and key == "rate_hz" and 0.01 <= value < 1.0:
+        return f"; in kHz? then it is {1e3 * value:g}"
+    return ""
 
 
 def _suggestion(key: str, depth: int, tables: Tables) -> str:

@@ -45,13 +45,14 @@ _LARGEST_SPEED_M_PER_S: Final = 10.0
 _TYRE_M: Final = (1e-3, 2.0)
 _LIGHTEST_DECK_KG_PER_M, _SHORTEST_BRIDGE_M = 100.0, 5.0
 """A deck of less is a laboratory's, and these are shorter."""
+_USUAL_DAMPING: Final = (0.002, 0.15)
 _SLIPS: Final[dict[str, dict[str, float]]] = {
     "N/m": {"kN/m": 1e3},
     "N·s/m": {"kN·s/m": 1e3},
     "N·m²": {"kN·m²": 1e3, "MN·m²": 1e6, "GN·m²": 1e9},
     "kg": {"t": 1e3},
     "kg/m": {"t/m": 1e3},
-    "m": {"mm": 1e-3, "cm": 1e-2},
+    "m": {"cm": 1e-2, "mm": 1e-3},
 }
 """Units in which values are written by mistake, with their factors, by the unit of a key."""
 
@@ -143,6 +144,7 @@ def check_bridge(bridge: "Bridge") -> None:
     first_hz = _first_hz(span, mass, mean)
     omega = 2.0 * math.pi * first_hz
     because = f"beyond it the first mode, {first_hz:.2g} Hz, does not swing"
+    because += _damping_meant(bridge.rayleigh_alpha_per_s, bridge.rayleigh_beta_s, omega)
     for key, value, most, noun, unit in (
         ("rayleigh_alpha_per_s", bridge.rayleigh_alpha_per_s, 2.0 * omega, "a coefficient", "1/s"),
         ("rayleigh_beta_s", bridge.rayleigh_beta_s, 2.0 / omega, "a time", "s"),
@@ -154,6 +156,23 @@ def check_bridge(bridge: "Bridge") -> None:
         _check(key, getattr(bridge, key), (low, high), "a rotational stiffness", "N·m/rad")
     key = "support_compliance_spread_m_per_n"
     _check(key, getattr(bridge, key), (_SMALLEST_COMPLIANCE_M_PER_N, 1e-6), "a compliance", "m/N")
+
+
+def in_tonnes(mass_kg: float) -> str:
+    """Return a hint that a mass of a truck may be in t; empty where it may not."""
+    return f"; in t? then it is {1e3 * mass_kg:g}" if 1.0 <= mass_kg <= 100.0 else ""
+
+
+def _damping_meant(alpha: float, beta: float, omega: float) -> str:
+    """Return a hint what coefficients of damping may be; empty where it is not known."""
+    exchanged = 0.5 * (beta / omega + alpha * omega)
+    if alpha and _USUAL_DAMPING[0] <= exchanged <= _USUAL_DAMPING[1]:
+        return "; exchanged with the other coefficient?"
+    if beta < 0.2:
+        return f"; a damping ratio? then it is {2.0 * beta / omega:.3g} s"
+    if beta <= 20.0:
+        return f"; a damping ratio in %? then it is {0.02 * beta / omega:.3g} s"
+    return ""
 
 
 def check_sensor(sensor: "Sensor") -> "Sensor":

@@ -29,7 +29,15 @@ _FAR: Final = 2.0
 _MAX_BRIDGES: Final = 50
 """Largest number of bridges with warnings: a fleet's site file has thousands."""
 
-_STIFFNESS: Final = (("kN/m", 1e3),)
+_STIFFNESS: Final = (("kN/m", 1e3), ("N/m times 1000", 1e-3))
+_TYRE_OVER_SPRING: Final = (0.9, 25.0)
+_FRONT_OVER_REAR: Final = (0.15, 2.5)
+"""Stiffness of a spring over the mass on it, front over rear: rear springs carry the load."""
+_AXLE_OVER_REAR: Final = (0.3, 1.4)
+_TYRE_WIDTH_M: Final = (0.1, 0.6)
+_TWIN_M: Final = (0.2, 0.6)
+_TRACK_M: Final = (1.0, 2.6)
+_SURVEY_M_PER_S: Final = (3.0, 30.0)
 _RIGIDITY: Final = (("kN·m²", 1e3), ("MN·m²", 1e6), ("GN·m²", 1e9))
 
 
@@ -53,6 +61,8 @@ class Implied(NamedTuple):
     unit: str
     meant: str
     """Probable intention; empty where there is none to suggest or the value is usual."""
+    is_certain: bool = True
+    """Whether a value far out of its range cannot be right."""
 
     @property
     def is_unusual(self) -> bool:
@@ -62,7 +72,7 @@ class Implied(NamedTuple):
     @property
     def is_far(self) -> bool:
         """Whether it is far out of its range."""
-        return self.value < self.low / _FAR or self.value > self.high * _FAR
+        return self.is_certain and (self.value < self.low / _FAR or self.value > self.high * _FAR)
 
     @property
     def advice(self) -> str:
@@ -102,9 +112,13 @@ def of_truck(vehicle: Vehicle) -> Iterator[Implied]:
         damping = vehicle.suspension_damping_ns_per_m[k]
         value = damping / (2.0 * math.sqrt(springs[k] * body))
         text = f"{vehicle.id}: damping ratio {value:.3g} of the body on its {where} springs"
+        critical = 2.0 * math.sqrt(springs[k] * body)
         slips = (
             Slip(
-                f"suspension_damping_ns_per_m[{k}]", damping, _power(value, 1.0), (("kN·s/m", 1e3),)
+                f"suspension_damping_ns_per_m[{k}]",
+                damping,
+                _power(value, 1.0),
+                (("kN·s/m", 1e3), ("N·s/mm", 1e3), *_as_ratio(damping, critical)),
             ),
             Slip(key, springs[k], _power(value, -0.5), _STIFFNESS),
         )
@@ -125,13 +139,65 @@ def of_truck(vehicle: Vehicle) -> Iterator[Implied]:
     value = _hz(springs[0] * arms[0] ** 2 + springs[1] * arms[1] ** 2, inertia)
     text = f"{vehicle.id}: body pitches at {value:.3g} Hz"
     yield _implied("pitch", text, value, _PITCH_HZ, "Hz", ())
+    yield from _odd(_pairs(vehicle, loads))
+    yield from _odd(_tyres(vehicle))
+
+
+def _pairs(vehicle: Vehicle, loads: tuple[float, float]) -> Iterator[Implied]:
+    """Yield ratios of a truck's pairs, which show exchanged values."""
+    exchanged = "[front, rear] exchanged?"
+    springs, tyres = vehicle.suspension_stiffness_n_per_m, vehicle.tyre_stiffness_n_per_m
+    for key, pair in (("suspension_stiffness", springs), ("tyre_stiffness", tyres)):
+        ratio = pair[0] / pair[1] * loads[1] / loads[0]
+        text = f"{vehicle.id}: {key} over its load, front over rear, {ratio:.3g}"
+        low, high = _FRONT_OVER_REAR
+        yield Implied(key, text, ratio, low, high, "", f"{key}_n_per_m: {exchanged}")
+    ratio = vehicle.unsprung_mass_kg[0] / vehicle.unsprung_mass_kg[1]
+    text = f"{vehicle.id}: front axle over rear axle, masses, {ratio:.3g}"
+    low, high = _AXLE_OVER_REAR
+    yield Implied("axle_masses", text, ratio, low, high, "", f"unsprung_mass_kg: {exchanged}")
+    ratio = min(tyre / spring for tyre, spring in zip(tyres, springs, strict=True))
+    text = f"{vehicle.id}: tyres over springs, stiffness, {ratio:.3g}"
+    low, high = _TYRE_OVER_SPRING
+    meant = "tyre_stiffness_n_per_m and suspension_stiffness_n_per_m exchanged?"
+    yield Implied("tyres_over_springs", text, ratio, low, high, "", meant if ratio < low else "")
+
+
+def _tyres(vehicle: Vehicle) -> Iterator[Implied]:
+    """Yield widths and distances of tyres and wheels."""
+    for key, pair, (low, high) in (
+        ("tyre_width_m", vehicle.tyre_width_m, _TYRE_WIDTH_M),
+        ("twin_tyre_distance_m", vehicle.twin_tyre_distance_m, _TWIN_M),
+        ("track_m", vehicle.track_m, _TRACK_M),
+    ):
+        for value in dict.fromkeys(pair or ()):
+            if value > 0.0:
+                text = f"{vehicle.id}: {key} {value:g} m"
+                yield Implied(key, text, value, low, high, "m", "")
+    apart = vehicle.twin_tyre_distance_m
+    if apart is not None and apart[0] > 0.0 == apart[1]:
+        text = f"{vehicle.id}: twin tyres in front, single ones behind"
+        meant = "twin_tyre_distance_m: [front, rear] exchanged?"
+        yield Implied("twin_tyres", text, 1.0, 0.0, 0.5, "", meant)
+
+
+def _odd(found: Iterator[Implied]) -> Iterator[Implied]:
+    """Yield what is unusual, never as certainly wrong: such trucks exist."""
+    for one in found:
+        if one.is_unusual:
+            yield one._replace(is_certain=False)
+
+
+def _as_ratio(damping: float, critical: float) -> tuple[tuple[str, float], ...]:
+    """Return a damping ratio as a unit of a damper, where the value may be one."""
+    return (("parts of critical damping", critical),) if 0.0 < damping <= 1.5 else ()
 
 
 def of_sensors(sensor: Sensor, vehicle: Vehicle) -> Iterator[Implied]:
     """Yield the noise densities that are unusual; 0 is a simulation without noise."""
     declared = tuple(one.noise_density_ug_per_rthz for one in vehicle.sensors)
     for density in dict.fromkeys(declared or sensor.noise_density_ug_per_rthz):
-        units = (("mg/√Hz", 1e3), ("m/s²/√Hz", 1e6 / _G_M_PER_S2))
+        units = (("mg/√Hz", 1e3), ("ng/√Hz", 1e-3), ("m/s²/√Hz", 1e6 / _G_M_PER_S2))
         slips = (Slip("noise_density_ug_per_rthz", density, _power(density, 1.0), units),)
         text = f"{vehicle.id}: noise {density:.3g} µg/√Hz"
         found = _implied("noise_usual", text, density, _NOISE_UG, "µg/√Hz", slips)
@@ -148,7 +214,12 @@ def of_bridge(bridge: Bridge, vehicle: Vehicle) -> Iterator[Implied]:
     usual = 100.0 / span
     slips: tuple[Slip, ...] = (
         Slip(key, rigidity, _power(first_hz, 0.5), _RIGIDITY),
-        Slip("mass_per_length_kg_per_m", mass, _power(first_hz, -0.5), (("t/m", 1e3),)),
+        Slip(
+            "mass_per_length_kg_per_m",
+            mass,
+            _power(first_hz, -0.5),
+            (("t/m", 1e3), ("kg of the whole span", 1.0 / bridge.span_m)),
+        ),
     )
     text = f"{bridge.id}: first natural frequency {first_hz:.3g} Hz"
     limits = (_FIRST_HZ[0] * usual, _FIRST_HZ[1] * usual)
@@ -162,6 +233,14 @@ def of_bridge(bridge: Bridge, vehicle: Vehicle) -> Iterator[Implied]:
         f"{span / deflection:.0f} of the span"
     )
     yield _implied("static_deflection", text, deflection / span, _DEFLECTION, "", slips)
+    speed = bridge.survey_speed_m_per_s
+    if speed is not None:
+        low, high = _SURVEY_M_PER_S
+        text = f"{bridge.id}: to be crossed at {speed:g} m/s"
+        slips = (Slip("survey_speed_m_per_s", speed, _power(speed, 1.0), (("km/h", 1 / 3.6),)),)
+        yield from _odd(
+            iter([_implied("survey_speed_usual", text, speed, (low, high), "m/s", slips)])
+        )
     ratio = vehicle.wheelbase_m / span
     text = f"{bridge.id}: wheelbase of {vehicle.id} is {ratio:.2g} of the span"
     yield _implied("wheelbase_over_span", text, ratio, (0.0, 1.0), "", ())

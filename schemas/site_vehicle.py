@@ -18,7 +18,7 @@ from schemas.site_numbers import (
     Table,
     Track,
 )
-from schemas.site_physics import check_vehicle
+from schemas.site_physics import check_vehicle, in_tonnes
 from schemas.site_sensors import MAX_SENSORS, PlacedSensor, check_places, check_sensors
 from schemas.site_tandem import Tandem, tandem_of
 
@@ -182,7 +182,7 @@ class Vehicle(WithSpreads):
             raise error_at(
                 "unsprung_mass_kg",
                 f"adds up to {sum(self.unsprung_mass_kg)}, it must be a mass less than "
-                f"total_mass_kg, {self.total_mass_kg} kg",
+                f"total_mass_kg, {self.total_mass_kg} kg{in_tonnes(self.total_mass_kg)}",
             )
         if self.tandem is not None and not self.sensors:
             raise error_at(

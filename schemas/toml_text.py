@@ -130,6 +130,12 @@ def _syntax(message: str, text: str) -> str:
             f"line {row}: is not TOML: {comma[1]},{comma[2]} has a decimal comma, "
             f"TOML has a point: {comma[1]}.{comma[2]}"
         )
+    line = text.split("\n")[row - 1] if row else ""
+    if re.fullmatch(r"[^=#]*=\s*[\d.]+,\d+\s*(#.*)?", line):
+        return f"line {row}: is not TOML: a decimal comma, or points between thousands: 16000.0"
+    unit = re.fullmatch(r"[^=#]*=\s*([-+\d.eE]+)\s*[^\d\s#,.\]][^#]*(#.*)?", line)
+    if unit is not None:
+        return f"line {row}: is not TOML: a number without a unit expected: {unit[1]}"
     if match[4]:
         return f"line {len(text.splitlines())}: is not TOML: {match[1]} before the end of the file"
     return f"line {match[2]}, column {match[3]}: is not TOML: {match[1]}"

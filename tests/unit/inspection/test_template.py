@@ -1,6 +1,7 @@
 """The site file to start from: it asks for all that is needed, and names all that there is."""
 
 import json
+import math
 import re
 import tomllib
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 from pydantic import BaseModel
 
 from schemas.site import Bridge, Receiver, Sensor, Vehicle
+from schemas.site_damping import rayleigh_of
 from schemas.site_file import faults_of_site, load_site, parse_site
 from services.cli import main as cli
 from services.inspection.template import TEMPLATE
@@ -46,8 +48,52 @@ def test_filled_in_it_is_the_site_that_was_meant(project: Path) -> None:
     filled = ""
     for name, text in parts().items():
         known = values.get(name, {})
+        if name == "bridge":
+            known |= {"damping_ratio": 0.02, "first_frequency_hz": 3.3}
         filled += f"[{name}]" + NEEDED.sub(lambda m, of=known: f"{m[1]} = {of[m[1]]}", text)
-    assert parse_site(filled, "filled") == load_site(example)
+    meant, found = load_site(example), parse_site(filled, "filled")
+    bridge = found.bridges[0]
+    assert tuple(coefficients(bridge).values()) == rayleigh_of(0.02, 3.3)
+    assert found.bridges[0].model_copy(update=coefficients(meant.bridges[0])) == meant.bridges[0]
+    assert found.model_copy(update={"bridges": meant.bridges}) == meant
+
+
+def coefficients(bridge: Bridge) -> dict[str, float]:
+    keys = ("rayleigh_alpha_per_s", "rayleigh_beta_s")
+    return {key: getattr(bridge, key) for key in keys}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("rayleigh_beta_s", "damping_ratio = 0.02\nrayleigh_beta_s", "remove one of them"),
+        ("rayleigh_", "damping_ratio = 0.02\n# ", "first_frequency_hz is missing, damping_ratio"),
+        (
+            "rayleigh_",
+            "damping_ratio = 0.02\nfirst_frequency_hz = 90\n# ",
+            "first_frequency_hz is 90, but flexural_rigidity_nm2",
+        ),
+        (
+            "rayleigh_",
+            "damping_ratio = 2.0\nfirst_frequency_hz = 4\n# ",
+            "damping_ratio is 2.0, it must be",
+        ),
+    ],
+)
+def test_wrong_damping_is_named(project: Path, old: str, new: str, words: str) -> None:
+    text = (project / "docs/site.example.toml").read_text()
+    changed = re.sub(rf"^{old}", new, text, count=1, flags=re.MULTILINE)
+    if old == "rayleigh_":
+        changed = re.sub(r"^rayleigh_", "# rayleigh_", changed, flags=re.MULTILINE)
+    with pytest.raises(Exception, match=re.escape(words)):
+        parse_site(changed, "site.toml")
+
+
+def test_damping_ratio_is_that_of_the_first_two_modes() -> None:
+    alpha, beta = rayleigh_of(0.02, 3.7)
+    for number in (1, 2):
+        omega = 2.0 * math.pi * 3.7 * number**2
+        assert 0.5 * (alpha / omega + beta * omega) == pytest.approx(0.02, rel=1e-12)
 
 
 def test_defaults_that_it_shows_are_the_defaults(project: Path) -> None:
@@ -76,7 +122,7 @@ def test_the_command_writes_it_and_spoils_nothing(
     assert lines[0].startswith("  wrong  vehicle.total_mass_kg is NaN, it must be a mass in kg")
     assert said.err.endswith(f"{new}: {len(lines)} things are wrong; nothing else was checked\n")
     assert said.err.count("\n") == 1
-    assert len(lines) > 25
+    assert len(lines) == len(NEEDED.findall(TEMPLATE))
     assert cli.main(["check", str(new), "--json"]) == 2
     (report,) = json.loads(capsys.readouterr().out)["reports"]
     assert [one["state"] for one in report["findings"]] == ["wrong"] * len(lines)

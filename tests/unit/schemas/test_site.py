@@ -279,7 +279,7 @@ def test_one_table_in_a_list_is_the_same_site() -> None:
         ("flexural_rigidity_nm2", "", "bridge.flexural_rigidity_nm2 is missing, give the sound"),
         ("rayleigh_beta_s", "-0.1", "bridge.rayleigh_beta_s is -0.1, it must be a time of at lea"),
         ("rate_hz", "[1, 2]", "sensor.rate_hz"),
-        ("rate_hz", "0", "sensor.rate_hz[0] is 0, it must be a rate of at least 1 Hz"),
+        ("rate_hz", "0", "sensor.rate_hz is 0, it must be a rate of at least 1 Hz"),
         ("rate_hz", "100\nup = [1, 1, 1, 0]", "sensor.up[3] is 0, it must be 1 or -1"),
         ("rate_hz", "100\ngravity_included = 1", "sensor.gravity_included is 1, it must be true"),
         ("rate_hz", "100\nrate_khz = 1", "sensor.rate_khz is not a known field, did you mean rate"),

@@ -68,6 +68,15 @@ SLIPS = [
     ("bridge", "flexural_rigidity_nm2", 1e-6, "in MN·m²? then it is"),
     ("bridge", "mass_per_length_kg_per_m", 1e-3, "in t/m? then it is"),
     ("sensor", "noise_density_ug_per_rthz", 1e-3, "in mg/√Hz? then it is"),
+    ("sensor", "noise_density_ug_per_rthz", 1e3, "in ng/√Hz? then it is"),
+    ("sensor", "rate_hz", 5e-4, "in kHz? then it is"),
+    ("vehicle", "tyre_stiffness_n_per_m", 1e3, "in N/m times 1000? then it is"),
+    ("vehicle", "wheelbase_m", 1e3, "in mm? then it is"),
+    ("vehicle", "wheelbase_m", 1e2, "in cm? then it is"),
+    ("vehicle", "front_axle_to_cg_m", 1e3, "in mm? then it is"),
+    ("bridge", "span_m", 1e3, "in mm? then it is"),
+    ("bridge", "span_m", 1e2, "in cm? then it is"),
+    ("bridge", "mass_per_length_kg_per_m", 30.0, "in kg of the whole span? then it is"),
 ]
 
 
@@ -86,3 +95,72 @@ def test_damping_ratio_for_a_coefficient_is_named() -> None:
     text = with_value("bridge", "rayleigh_beta_s", "0.04")
     (line,) = warnings_of(parse_site(text, "site.toml"))
     assert "rayleigh_beta_s is 0.04: a damping ratio? then it is 0.00" in line
+
+
+PAIRS = [
+    ("suspension_stiffness_n_per_m", "[3.0e6, 3.0e5]"),
+    ("tyre_stiffness_n_per_m", "[9.0e6, 1.0e6]"),
+    ("unsprung_mass_kg", "[1100, 500]"),
+    ("twin_tyre_distance_m", "[0.33, 0.0]"),
+]
+
+
+@pytest.mark.parametrize(("key", "value"), PAIRS)
+def test_exchanged_pair_is_named(key: str, value: str) -> None:
+    text = TEXT
+    if f"\n{key} = " not in text:
+        text = text.replace("[bridge]", f"{key} = {value}\n\n[bridge]", 1)
+    else:
+        text = with_value("vehicle", key, value)
+    lines = warnings_of(parse_site(text, "site.toml"))
+    assert any(f"{key}: [front, rear] exchanged?" in line for line in lines), lines
+
+
+def test_springs_for_tyres_are_named() -> None:
+    text = with_value("vehicle", "tyre_stiffness_n_per_m", "[5e5, 8e5]")
+    begin = text.index("\nsuspension_stiffness_n_per_m = ") + 1
+    end = text.index("\n", begin)
+    text = f"{text[:begin]}suspension_stiffness_n_per_m = [1.8e6, 3.5e6]{text[end:]}"
+    lines = warnings_of(parse_site(text, "site.toml"))
+    wanted = "tyre_stiffness_n_per_m and suspension_stiffness_n_per_m exchanged?"
+    assert any(wanted in line for line in lines), lines
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"total_mass_kg": "17.7"}, "in t? then it is 17700"),
+        ({"rayleigh_beta_s": "2.0"}, "a damping ratio in %? then it is 0.00"),
+        ({"rayleigh_alpha_per_s": "0.0005", "rayleigh_beta_s": "0.7"}, "exchanged with the other"),
+        ({"suspension_damping_ns_per_m": "[0.2, 0.2]"}, "in parts of critical damping? then it is"),
+        ({"span_m": "30,0"}, "30,0 has a decimal comma"),
+        ({"span_m": "30.0 m"}, "a number without a unit expected: 30.0"),
+        ({"total_mass_kg": "17.700,0"}, "a decimal comma, or points between thousands"),
+    ],
+)
+def test_likely_slip_is_named(changes: dict[str, str], words: str) -> None:
+    text = TEXT
+    for key, value in changes.items():
+        begin = text.index(f"\n{key} = ") + 1
+        text = f"{text[:begin]}{key} = {value}{text[text.index(chr(10), begin) :]}"
+    try:
+        said = warnings_of(parse_site(text, "site.toml"))
+    except InputError as error:
+        said = [str(error)]
+    assert any(words in line for line in said), said
+
+
+def test_exchanged_coordinates_of_the_ends_are_named() -> None:
+    text = (ROOT / "tests/data/csv_example/site.toml").read_text()
+    swapped = text.replace("_latitude_", "_x_").replace("_longitude_", "_latitude_")
+    with pytest.raises(InputError, match=r"latitude and longitude exchanged\?$"):
+        parse_site(swapped.replace("_x_", "_longitude_"), "site.toml")
+    far = text.replace("start_latitude_deg = 47.0", "start_latitude_deg = 147.0")
+    with pytest.raises(InputError, match=r"angle of at most 89 degrees; a longitude\?"):
+        parse_site(far, "site.toml")
+
+
+def test_survey_speed_in_km_per_h_is_named() -> None:
+    text = TEXT.replace("[sensor]", "survey_speed_m_per_s = 50.0\n\n[sensor]", 1)
+    (line,) = warnings_of(parse_site(text, "site.toml"))
+    assert "survey_speed_m_per_s is 50: in km/h? then it is 13.8889" in line
