@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.parameters import unit
 from services.common.errors import InputError
 from services.common.extras import check_installed
 from services.common.files import replaced_atomically
@@ -51,11 +52,18 @@ def check_draws_file(path: Path) -> None:
         check_installed(f"{path}: NetCDF", "xarray", "h5netcdf", otherwise=otherwise)
 
 
-def write_draws(path: Path, crossings: Iterable[DrawsOfCrossing]) -> None:
-    """Write the draws of the crossings that have some; an existing file is replaced."""
+def write_draws(
+    path: Path,
+    crossings: Iterable[DrawsOfCrossing],
+    groups: "Mapping[str, xr.Dataset] | None" = None,
+) -> None:
+    """Write the draws of the crossings that have some; an existing file is replaced.
+
+    A NetCDF file also gets `groups` beside its group `posterior`.
+    """
     some = [crossing for crossing in crossings if crossing.draws]
     if path.suffix == ".nc":
-        _write_netcdf(path, some)
+        _write_netcdf(path, {"posterior": posterior(some), **(groups or {})})
         return
     if len(some) == 1:
         arrays: Mapping[str, NDArray[np.float64]] = some[0].draws
@@ -97,9 +105,20 @@ def posterior(crossings: Iterable[DrawsOfCrossing]) -> "xr.Dataset":
             values = np.stack([_thinned(c.draws[name], length) for c in alike], axis=-1)
             chains = {"chain": np.arange(values.shape[0]), "draw": np.arange(length)}
             arrays[f"{prefix}{name}"] = xr.DataArray(
-                values, dims=("chain", "draw", dimension), coords={**chains, **of_each}
+                values,
+                dims=("chain", "draw", dimension),
+                coords={**chains, **of_each},
+                attrs={"units": _unit(name)},
             )
     return xr.Dataset(arrays, attrs={"inference_library": "driveby"})
+
+
+def _unit(name: str) -> str:
+    """Return the SI unit of the draws of a name, that of its ending beyond the parameters."""
+    try:
+        return unit(name)
+    except KeyError:
+        return "m" if name.endswith("_m") else ""
 
 
 def _length(draws: Draws) -> int:
@@ -110,7 +129,7 @@ def _thinned(values: NDArray[np.float64], length: int) -> NDArray[np.float64]:
     return values[:, np.arange(length) * values.shape[1] // length]
 
 
-def _write_netcdf(path: Path, crossings: list[DrawsOfCrossing]) -> None:
-    dataset = posterior(crossings)
+def _write_netcdf(path: Path, groups: "Mapping[str, xr.Dataset]") -> None:
     with replaced_atomically(path) as temporary:
-        dataset.to_netcdf(temporary, group="posterior", engine="h5netcdf")
+        for number, (name, dataset) in enumerate(groups.items()):
+            dataset.to_netcdf(temporary, mode="a" if number else "w", group=name, engine="h5netcdf")

@@ -20,6 +20,7 @@ from services.history.draws import (
     posterior,
     write_draws,
 )
+from services.notebook.inference import prior_of, statistics_of
 from services.notebook.showing import MAX_SHOWN, all_as_html, as_html, counted, one_line
 
 if TYPE_CHECKING:
@@ -126,8 +127,14 @@ class Identification(NamedTuple):
         """
         return posterior(_draws_of(solution) for solution in self.solutions)
 
+    def prior(self) -> "xr.Dataset":
+        """Return draws of the priors, named as the posterior's; needs xarray."""
+        return prior_of([solution.crossing for solution in self.solutions if solution.draws])
+
     def to_netcdf(self, path: str | Path) -> None:
         """Write the draws, as `driveby identify --draws` does; `arviz.from_netcdf` reads `.nc`.
+
+        A `.nc` also holds the groups `prior` and `sample_stats`; arrays have `units`.
 
         Raise InputError without draws, or if xarray and h5netcdf are not installed and the file is
         no `.npz`.
@@ -135,7 +142,12 @@ class Identification(NamedTuple):
         check_draws_file(Path(path))
         if not any(solution.draws for solution in self.solutions):
             raise InputError(f"{path}: no crossing has draws; method pre has, with draws=True")
-        write_draws(Path(path), (_draws_of(solution) for solution in self.solutions))
+        some = [solution for solution in self.solutions if solution.draws]
+        groups = {}
+        if Path(path).suffix == ".nc":
+            crossings = [solution.crossing for solution in some]
+            groups = {"prior": prior_of(crossings), "sample_stats": statistics_of(crossings)}
+        write_draws(Path(path), (_draws_of(solution) for solution in some), groups)
 
     def to_json(self, path: str | Path) -> None:
         """Write results.json, as `driveby identify --json` does."""

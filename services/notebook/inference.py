@@ -1,0 +1,70 @@
+"""Prior draws and diagnostics of crossings, beside their posterior draws, as ArviZ groups them."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.results import CrossingResult, Prior
+from services.common.extras import check_installed
+from services.history.draws import DrawsOfCrossing, posterior
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Floats = NDArray[np.float64]
+
+_DRAWS: Final = 2000
+_SEED: Final = 1
+
+
+def prior_of(crossings: Sequence[CrossingResult]) -> "xr.Dataset":
+    """Return draws of the priors as arrays (chain, draw, crossing), one chain of 2000.
+
+    The names are those of the posterior. Common factors of mass and gain are not in them.
+    """
+    rng = np.random.default_rng(_SEED)
+    drawn = []
+    for crossing in crossings:
+        known = {n: p.prior for n, p in (crossing.parameters or {}).items() if p.prior is not None}
+        draws = {name: _drawn(prior, rng)[np.newaxis] for name, prior in known.items()}
+        drawn.append(
+            DrawsOfCrossing(crossing.crossing_id, crossing.vehicle, crossing.bridge, draws)
+        )
+    return posterior(drawn)
+
+
+def _drawn(prior: Prior, rng: np.random.Generator) -> Floats:
+    """Return draws (n,) of a prior."""
+    if prior.distribution == "uniform":
+        return prior.location + prior.scale * rng.uniform(-1.0, 1.0, _DRAWS)
+    standard = rng.standard_normal(_DRAWS)
+    if prior.distribution == "log_normal":
+        return np.asarray(prior.location * np.exp(prior.scale * standard))
+    if prior.distribution == "half_normal":
+        standard = np.abs(standard)
+    return np.asarray(prior.location + prior.scale * standard)
+
+
+def statistics_of(crossings: Sequence[CrossingResult]) -> "xr.Dataset":
+    """Return diagnostics of the draws and of the fit as arrays (crossing,), NaN where absent."""
+    check_installed("a dataset of diagnostics", "xarray")
+    import xarray as xr
+
+    names = sorted({name for crossing in crossings for name in crossing.diagnostics})
+    rows = {
+        name: [float(crossing.diagnostics.get(name, np.nan)) for crossing in crossings]
+        for name in names
+    }
+    rows["chi2_per_dof"] = [
+        np.nan if crossing.chi2_per_dof is None else crossing.chi2_per_dof for crossing in crossings
+    ]
+    return xr.Dataset(
+        {name: ("crossing", values) for name, values in rows.items()},
+        coords={
+            "crossing": [crossing.crossing_id for crossing in crossings],
+            "verdict": ("crossing", [str(crossing.verdict) for crossing in crossings]),
+        },
+        attrs={"inference_library": "driveby"},
+    )
