@@ -104,7 +104,7 @@ def test_systemd_accepts_the_units(tmp_path: Path) -> None:
         ["systemd-analyze", "verify", *paths], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
-    for path in paths:
+    for verified in paths:
         security = ["systemd-analyze", "security", "--offline=true", f"--threshold={EXPOSURE}"]
-        done = subprocess.run([*security, path], capture_output=True, text=True, check=False)
+        done = subprocess.run([*security, verified], capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout

@@ -16,7 +16,6 @@ from scipy.linalg import cholesky_banded, solve_banded
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing.channels import A_1, A_2, A, V, Z, channel_signals
 from pre_core.crossing.noise import (
-    REDUCED_WEIGHT_SPRING_N_PER_M,
     NoisePath,
     no_force_noise,
     noise_power,
@@ -29,6 +28,7 @@ from pre_core.crossing.rows import (
     row_count,
     row_filter,
 )
+from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_SPRING_N_PER_M
 from pre_core.crossing.whitening import Whitener, white_rows, whitener
 from pre_core.parameters import C_S1, K_S1, K_U1, M_U1
 from pre_core.physics.models import from_models
