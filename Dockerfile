@@ -1,5 +1,6 @@
-# Two images. `service`, the default, has every extra and runs every command; `truck` is the small one
-# of a truck's computer without any: publisher and spool, `driveby truck` and `driveby health`. See
+# Three images. `service` runs what computes, records and stores: every extra but `view` and
+# `notebook`. `view` adds these to it and runs every command. `truck` is the small one of a truck's
+# computer without any extra: publisher and spool, `driveby truck` and `driveby health`. See
 # compose.yaml.
 #
 # The base image is named by its tag: no registry was within reach when this was written, so its
@@ -40,13 +41,23 @@ COPY --from=wheel /wheels /wheels
 RUN pip --python /opt/driveby/bin/python install --no-deps --no-index /wheels/*.whl
 
 FROM tools AS service-environment
-COPY requirements/runtime.txt requirements/
+COPY requirements/service.txt requirements/
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf --mount=type=secret,id=authorities \
     if [ -s /run/secrets/authorities ]; then export PIP_CERT=/run/secrets/authorities; fi \
-    && pip --python /opt/driveby/bin/python install --no-compile --require-hashes -r requirements/runtime.txt
+    && pip --python /opt/driveby/bin/python install --no-compile --require-hashes -r requirements/service.txt
 RUN /slim_environment /opt/driveby
 COPY --from=wheel /wheels /wheels
 RUN pip --python /opt/driveby/bin/python install --no-deps --no-index /wheels/*.whl
+
+# Only what is new goes into the image, so that it shares all else with `service`.
+FROM service-environment AS view-environment
+COPY requirements/runtime.txt requirements/
+RUN --mount=type=secret,id=pip,target=/etc/pip.conf --mount=type=secret,id=authorities \
+    if [ -s /run/secrets/authorities ]; then export PIP_CERT=/run/secrets/authorities; fi \
+    && touch /before \
+    && pip --python /opt/driveby/bin/python install --no-compile --require-hashes -r requirements/runtime.txt
+RUN /slim_environment /opt/driveby && mkdir /new && cd / \
+    && find opt/driveby -newer /before ! -type d -print0 | tar --null -cT - | tar -xC /new
 
 FROM ${BASE} AS common
 ENV PATH=/opt/driveby/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
@@ -65,10 +76,16 @@ USER driveby
 FROM common AS service
 COPY --from=service-environment /opt/driveby /opt/driveby
 # Python writes compiled what is imported here, and nothing when it runs: its files are read-only.
-RUN python -c "import driveby.services.logger.run, driveby.services.viewer.rerun_file" \
+RUN python -c "import driveby.services.logger.run, driveby.services.cli.metrics" \
     && python -c "import driveby.services.worker, driveby.services.simulation.drive" \
     && driveby health --help >/dev/null
 # The root file system is read-only and numba wants to write beside what it reads, so entrypoint.sh
 # copies these 8 MB to memory.
 RUN NUMBA_CACHE_DIR=/app/kernels /app/entrypoint.sh python -m driveby.services.execution.warm_up --strict
+USER driveby
+
+FROM service AS view
+USER root
+COPY --from=view-environment /new /
+RUN python -c "import driveby.services.viewer.rerun_file"
 USER driveby

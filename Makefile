@@ -6,7 +6,7 @@ PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo up down test test-all faults soak day year mutants validate lint tables docs dist matrix coverage bench lock clean
+.PHONY: help install demo up down test test-all faults containers soak day year mutants validate lint tables docs dist matrix coverage bench lock clean
 
 help: ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -50,6 +50,9 @@ test-all: $(STAMP) ## the default tests and the slow ones
 
 faults: $(STAMP) ## everything that tries to lose or break data, but the soak (20 to 30 minutes)
 	$(BIN)/python -m pytest tests/faults -m "not soak" --session-timeout=2400
+
+containers: $(STAMP) ## make up, faults, limits and confinement in an engine of containers (12 minutes)
+	$(BIN)/python -m pytest tests/containers -m containers
 
 KILLS ?= 50
 MINUTES ?= 60
@@ -113,6 +116,7 @@ bench: $(STAMP) ## time everything, with its peers, into studies/benchmarks.md (
 
 lock: ## write the pinned requirements anew (needs uv)
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --extra all pyproject.toml -o requirements/runtime.txt
+	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate -c requirements/runtime.txt --extra identify --extra history --extra s3 --extra ros2 --extra cluster pyproject.toml -o requirements/service.txt
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate -c requirements/runtime.txt pyproject.toml -o requirements/truck.txt
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --extra dev pyproject.toml -o requirements/dev.txt
 	sed -n '/^docs = \[/,/^]/s/^ *"\(.*\)",.*/\1/p' pyproject.toml | uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate -c requirements/dev.txt - -o requirements/docs.txt

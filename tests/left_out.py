@@ -5,7 +5,12 @@ from typing import Any
 
 import pytest
 
-COMMANDS = {"soak": "make soak", "faults": "make faults", "slow": "make test-all"}
+COMMANDS = {
+    "soak": "make soak",
+    "faults": "make faults",
+    "containers": "make containers",
+    "slow": "make test-all",
+}
 """Command that runs the tests of each mark; the first mark that a test has decides."""
 REMEDIES = {
     "Vulkan": "apt install mesa-vulkan-drivers libvulkan1",
@@ -16,6 +21,7 @@ REMEDIES = {
     "zsh is not": "apt install zsh",
     "tmpfs": "run as root",
     "root may": "run as another user than root",
+    "for containers": "sh tests/containers/engine.sh start; sh tests/containers/images.sh",
     "../shared": "reference data, not in the repository",
 }
 """Remedy of each reason to skip, by a part of the reason."""

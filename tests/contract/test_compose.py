@@ -17,9 +17,10 @@ import yaml
 from distributed.cli import dask_scheduler, dask_worker
 
 from services.cli import main as cli
+from tests.builders.compose_file import with_defaults
 
 ROOT = Path(__file__).parents[2]
-COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text())
+COMPOSE = yaml.safe_load(with_defaults((ROOT / "compose.yaml").read_text()))
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
 LASTING = ("router", "logger", "worker")
@@ -137,12 +138,12 @@ def test_the_client_of_the_cluster_finds_its_scheduler() -> None:
 
 def test_only_loopback_is_published() -> None:
     ports = [port for service in SERVICES.values() for port in service.get("ports", [])]
-    assert ports == ["127.0.0.1:7447:7447"]
+    assert ports == ["127.0.0.1:7447:7447", "127.0.0.1:9464:9464"]
 
 
 def test_the_image_is_built_of_what_is_pinned_by_hash() -> None:
     steps = re.findall(r"^(?:RUN|    &&).* (pip .*(?:\\\n.*)*)$", DOCKERFILE, re.MULTILINE)
-    assert len(steps) == 6
+    assert len(steps) == 7
     for step in steps:
         assert ("--require-hashes" in step) != ("--no-index" in step)
         assert ("--no-build-isolation" in step) == (" wheel " in step)
@@ -177,16 +178,22 @@ def pinned(name: str) -> set[str]:
 
 
 def test_the_truck_has_the_versions_of_the_others_and_nothing_that_draws() -> None:
-    assert pinned("truck") < pinned("runtime")
+    assert pinned("truck") < pinned("service") < pinned("runtime")
     names = {line.split("==")[0] for line in pinned("truck")}
     assert names.isdisjoint({"rerun-sdk", "duckdb", "matplotlib", "pyarrow", "scipy", "numba"})
+
+
+def test_the_service_has_all_extras_but_those_that_draw() -> None:
+    left_out = {line.split("==")[0] for line in pinned("runtime") - pinned("service")}
+    assert {"rerun-sdk", "matplotlib", "pandas", "xarray"} <= left_out
+    assert left_out.isdisjoint({"numba", "duckdb", "pyarrow", "s3fs", "rosbags", "distributed"})
 
 
 def test_trucks_meet_the_router_only() -> None:
     on = {name: set(service["networks"]) for name, service in SERVICES.items()}
     assert {name for name in on if on["truck"] & on[name]} == {"truck", "router"}
     assert [n for n, network in COMPOSE["networks"].items() if not (network or {}).get("internal")]
-    assert {name for name in on if "outside" in on[name]} == {"router"}
+    assert {name for name in on if "outside" in on[name]} == {"router", "metrics"}
 
 
 @pytest.mark.parametrize("name", SERVICES)

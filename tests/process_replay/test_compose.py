@@ -22,14 +22,15 @@ import yaml
 import zenoh
 
 from services.bus.credentials import CONFIGURATION, link_settings
+from tests.builders.compose_file import with_defaults
 from tests.endpoints import free_endpoint
 
 pytestmark = [pytest.mark.process, pytest.mark.slow, pytest.mark.timeout(900)]
 
 ROOT = Path(__file__).parents[2]
-SERVICES: dict[str, dict[str, Any]] = yaml.safe_load((ROOT / "compose.yaml").read_text())[
-    "services"
-]
+SERVICES: dict[str, dict[str, Any]] = yaml.safe_load(
+    with_defaults((ROOT / "compose.yaml").read_text())
+)["services"]
 IMAGE_ENV = dict(
     pair.split("=", 1)
     for line in re.findall(r"^ENV (.*)$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
