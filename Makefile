@@ -37,7 +37,7 @@ up: ## the demo's services as containers (Docker Engine 26.0, Compose 2.26)
 	docker compose up --detach truck
 
 down: ## end the containers; recordings, results, spools and certificates stay in their volumes
-	docker compose --profile setup --profile cluster down --remove-orphans
+	docker compose --profile '*' down --remove-orphans
 
 # One worker computes while the other one waits for processes (tests/groups.py).
 BESIDE := -n 2 --dist loadgroup

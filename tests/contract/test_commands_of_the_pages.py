@@ -105,6 +105,7 @@ NOT_RUN = {
     "make mutants MUTANTS=30 SEED=1": LONG,
     "make up": ENGINE,
     "make down": ENGINE,
+    "make containers": ITSELF,
     "make docs": "needs a network the first time; tests/contract/test_site.py builds the site",
     'pip install ".[identify,view,notebook]"': NETWORK,
     'pip install "driveby[identify,view,notebook]"': NETWORK,
