@@ -97,6 +97,7 @@ start() {
 
 stop() {
     [ -e "$folder/pid" ] && kill -- -"$(cat "$folder/pid")" && rm "$folder/pid"
+    rm -f "$folder/sockets/docker.sock"
     disconnect || true
 }
 
