@@ -77,7 +77,7 @@ FROM common AS service
 COPY --from=service-environment /opt/driveby /opt/driveby
 # Python writes compiled what is imported here, and nothing when it runs: its files are read-only.
 RUN python -c "import driveby.services.logger.run, driveby.services.cli.metrics" \
-    && python -c "import driveby.services.worker, driveby.services.simulation.drive" \
+    && python -c "import driveby.services.worker.run, driveby.services.simulation.drive" \
     && driveby health --help >/dev/null
 # The root file system is read-only and numba wants to write beside what it reads, so entrypoint.sh
 # copies these 8 MB to memory.
