@@ -44,6 +44,7 @@ from services.simulation.drive import (
     declared_site,
     measured_run,
     paper_site,
+    with_two_axles,
 )
 from services.simulation.drive_wide import LONGEST_STEP_S as LONGEST_WIDE_STEP_S
 from services.simulation.drive_wide import Width, measured_wide_run
@@ -263,7 +264,7 @@ def drive(
 
     The noise is that of the conditions, unless that of each channel is given.
     """
-    vehicle, bridge, how = site.vehicles[0], site.bridges[0], truth.conditions
+    vehicle, bridge, how = with_two_axles(site.vehicles[0]), site.bridges[0], truth.conditions
     longest_s = LONGEST_STEP_S if truth.width is None else LONGEST_WIDE_STEP_S
     every = max(1, int(np.ceil(1.0 / (how.rate_hz * longest_s))))
     step_s = 1.0 / (how.rate_hz * every)

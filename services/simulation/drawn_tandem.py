@@ -11,6 +11,7 @@ import numpy as np
 
 from schemas.site import Site, Vehicle
 from services.common.errors import InputError
+from services.drives.runs import Run
 from services.simulation.drawn import ChannelErrors, CrossingTruth
 from services.simulation.drive_tandem import TandemDrive, tandem_case, truck_with_tandem
 from services.simulation.wheel_paths import SurfaceOptions
@@ -49,6 +50,11 @@ class DrawnTandem(NamedTuple):
     site: Site
     """Declared site: nominal values, with noise and rate of the sensors."""
     driven: WideDrivenRun
+
+    @property
+    def recorded(self) -> tuple[Run, Site]:
+        """The recorded run, and the site that declares its sensors."""
+        return self.driven.run, self.site
 
 
 def drawn_tandem(
@@ -104,7 +110,10 @@ def drawn_tandem(
             receiver.position_spread_m, receiver.position_noise_m, receiver.speed_noise_m_per_s
         ),
     )
-    return DrawnTandem(case, site, drive_case(case, 0))
+    rated = tuple(one.model_copy(update={"rate_hz": how.rate_hz}) for one in vehicle.sensors)
+    declared = vehicle.model_copy(update={"sensors": rated})
+    declared_site = site.model_copy(update={"vehicles": (declared,)})
+    return DrawnTandem(case, declared_site, drive_case(case, 0))
 
 
 def _with_errors(

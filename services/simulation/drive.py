@@ -366,8 +366,19 @@ def given_road(given: str | tuple[ArrayLike, ArrayLike]) -> str | Profile:
     return road
 
 
+def with_two_axles(vehicle: Vehicle) -> Vehicle:
+    """Return the truck; raise InputError for a tandem, which the plane simulation does not have."""
+    if vehicle.tandem is not None:
+        raise InputError(
+            f"{vehicle.id}: has a tandem, it must be a truck of two axles; `driveby simulate`, "
+            "`survey` and `validate --site` compute crossings of a tandem"
+        )
+    return vehicle
+
+
 def truck_of(vehicle: Vehicle) -> HalfCar:
-    """Return the site's nominal truck."""
+    """Return the site's nominal truck; raise InputError for one with a tandem."""
+    vehicle = with_two_axles(vehicle)
     return HalfCar(
         body_mass_kg=vehicle.sprung_mass_kg,
         front_axle_to_cg_m=vehicle.front_axle_to_cg_m,

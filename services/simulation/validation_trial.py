@@ -255,7 +255,7 @@ def _driven(
 ) -> tuple[Run, Site]:
     """Return the recorded run of a crossing, and the site that declares its sensors."""
     if site.vehicles[0].tandem is not None:
-        return drawn_tandem(site, truth, seed, seed).driven.run, site
+        return drawn_tandem(site, truth, seed, seed).recorded
     drawn = drive(site, truth, seed, noise_ug_per_rthz=conditions.noise_density_ug_per_rthz)
     return drawn.run, drawn.site
 

@@ -84,8 +84,7 @@ def _driven(site: Site, of: SurveyKind, survey: int, number: int, truck: int) ->
     truth, seed = crossing_truth(site, of, survey, number, truck)
     if of.has_tandem:
         world = TandemWorld(of.friction_share, of.offset_m, wander_m=of.wander_m)
-        drawn = drawn_tandem(site, truth, seed, 1000 * survey + truck, world)
-        return drawn.driven.run, drawn.site
+        return drawn_tandem(site, truth, seed, 1000 * survey + truck, world).recorded
     one = drive(site, truth, seed)
     return one.run, one.site
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.planning.crossings import scale_error
+from services.planning.crossings import axles_of, scale_error
 from services.simulation.drawn import default_site
 from services.simulation.survey_kinds import KINDS
 from studies.validation import forecasts
@@ -48,3 +48,15 @@ def test_a_forecast_knows_the_noise_and_the_bridge_of_its_kind() -> None:
 def own(std: float, common: float) -> float:
     """Without what is common to all elements."""
     return float(np.sqrt(std**2 - common**2))
+
+
+def test_plan_of_a_tandem_has_its_truck_and_its_offset() -> None:
+    site = default_site()
+    for name, offset_m in (("tandem", 0.005), ("tandem-rubbing", 0.005), ("tandem-aside", 0.02)):
+        ((slow, fast),) = forecasts._plan(site, KINDS[name]).tracks
+        vehicle = slow.site.vehicles[0]
+        assert vehicle == fast.site.vehicles[0]
+        assert vehicle.tandem is not None
+        assert vehicle.tandem.is_equalised
+        assert axles_of(vehicle)[1].offset_m == offset_m
+        assert slow.site.bridges == site.bridges

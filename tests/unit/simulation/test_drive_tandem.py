@@ -14,7 +14,7 @@ from services.cli.main import main
 from services.common.geodesy import bridge_frame, to_chainage
 from services.execution.offline import identify_recordings, site_of
 from services.finding.placed import middle_site
-from services.simulation.drawn import draw_truth
+from services.simulation.drawn import draw_truth, drive
 from services.simulation.drawn_tandem import TandemWorld, drawn_tandem, drawn_vehicle
 from services.simulation.drive_tandem import TandemDrive, tandem_case
 from services.simulation.tandem_cases import draw_tandem
@@ -152,6 +152,11 @@ def test_drawn_crossing_has_the_errors_of_the_truth() -> None:
     assert (case.truck.axles[2].offset_m, case.truck.axles[2].outer_share) == (0.02, 0.55)
     assert case.truck.axles[1].friction_n > 0.0
     assert drawn_tandem(site, truth, 7, 1, world).case == case
+    run, declared = drawn.recorded
+    assert run.rate_hz == 200.0
+    assert {one.rate_hz for one in declared.vehicles[0].sensors} == {200.0}
+    with pytest.raises(InputError, match="has a tandem, it must be a truck of two axles"):
+        drive(site, truth, 7)
     own = parse_site(TEXT.replace("equalised = true", "equalised = false"), "site.toml")
     with pytest.raises(InputError, match="axles 2 and 3 have springs of their own"):
         drawn_tandem(own, truth, 7, 1)
