@@ -164,6 +164,8 @@ NOT_RUN = {
         LONG
     ),
     "python -m studies.scripts.pavement --search --crossings 1 --decks 2.5": LONG,
+    "python -m studies.scripts.tandems --kinds loaded aside unequal --crossings 40 "
+    "--records build/tandems.jsonl": LONG,
     "python -m pytest -m slow tests/studies/test_validation.py": LONG,
     "python -m tests.verdicts.measure": LONG,
     "python -m tests.verdicts.measure signals 300": LONG,
