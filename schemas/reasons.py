@@ -38,8 +38,6 @@ class Reason(StrEnum):
     # Diagnostics of the fit.
     NO_NOISE_MODEL = "no_noise_model"
     MODEL_MISFIT = "model_misfit"
-    MISFIT_ON_BRIDGE = "misfit_on_bridge"
-    MISFIT_OFF_BRIDGE = "misfit_off_bridge"
     RESIDUALS_COLOURED = "residuals_coloured"
     NOISE_ABOVE_DECLARED = "noise_above_declared"
     NOISE_BELOW_DECLARED = "noise_below_declared"
@@ -102,14 +100,6 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     ),
     Reason.NO_NOISE_MODEL: "The method has no noise model, so it provides no valid intervals.",
     Reason.MODEL_MISFIT: "The model does not explain the measured accelerations.",
-    Reason.MISFIT_ON_BRIDGE: (
-        "Truck and road fit the model before and behind the bridge, but not on it: another vehicle "
-        "was on the bridge, or its length or supports are not those of the site file."
-    ),
-    Reason.MISFIT_OFF_BRIDGE: (
-        "The model does not explain the measured accelerations even before and behind the bridge: "
-        "the truck, its load or its sensors are not those of the site file."
-    ),
     Reason.RESIDUALS_COLOURED: "The residuals are not random noise.",
     Reason.NOISE_ABOVE_DECLARED: "The accelerometers are noisier than the site file says.",
     Reason.NOISE_BELOW_DECLARED: (

@@ -42,9 +42,6 @@ _CLEAR_FRICTION_WEIGHT = 0.05
 _NO_FIT_CHI2 = 10.0
 """Limit of chi2 at five times the noise: sound starts of 90 drawn crossings had 1.6 at most, wrong
 ones 10 to 70."""
-HOPELESS_CHI2 = 25.0
-"""Value of chi2 at a minimum above which neither another noise nor another offset nearby is tried.
-"""
 _MAX_ROUNDS, _EARLY_ROUNDS = 6, 2
 """Limit of alternating fits and noise estimates, finally and in earlier stages."""
 _MAX_STEPS, _EARLY_STEPS = 25, 8
@@ -95,11 +92,6 @@ class Optimum(NamedTuple):
     noise_power: float = 1.0
     """Noise power ratio where it clearly exceeds one, which resembles friction and mismatch. Up to
     `HOPELESS_NOISE` the fit used it."""
-    fits_off_bridge: bool | None = None
-    """Whether truck and road alone explain the residuals off the bridge, with one profile, while
-    this does not fit; None where that was not judged."""
-    off_bridge_y: FloatArray | None = None
-    """Coordinates of the truck that explains them."""
 
 
 def chi2_per_dof(problem: PosteriorProblem, y: FloatArray) -> float:
@@ -186,12 +178,7 @@ def _not_negative(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
 def is_accepted(problem: PosteriorProblem, chi2: float) -> bool:
     """Return whether a minimum of this chi2 is accepted."""
     judged = problem.noise.reciprocal.size // chi2_stride(problem)
-    return is_accepted_chi2(chi2, judged, differs=bool(problem.mismatch.level_m3.any()))
-
-
-def is_accepted_chi2(chi2: float, judged: int, *, differs: bool = False) -> bool:
-    """Return whether a chi2 of `judged` residuals is accepted, with mismatch if `differs`."""
-    excess = _EXCESS_WITH_MISMATCH if differs else _ACCEPTED_EXCESS
+    excess = _EXCESS_WITH_MISMATCH if problem.mismatch.level_m3.any() else _ACCEPTED_EXCESS
     return chi2 < 1.0 + excess + _ACCEPTED_Z * float(np.sqrt(2.0 / judged))
 
 
@@ -259,12 +246,6 @@ def fit_all(
     if problem.force.any():
         problem, y, ending, used = _fit_in_noise_rounds(problem, y, free, _MAX_ROUNDS, _at_misfit)
         evaluations += used
-        if ending is not Termination.CONVERGED and is_accepted(problem, chi2_per_dof(problem, y)):
-            # A valley of springs and friction: what fits has only further to go.
-            problem, y, ending, used = _fit_in_noise_rounds(
-                problem, y, free, _MAX_ROUNDS, _at_misfit
-            )
-            evaluations += used
     state = levenberg_marquardt.initial_state(lambda at: all_rows(problem, at), y)
     found = Optimum(problem, state, ending, chi2_per_dof(problem, y), evaluations, 1)
     return found, evaluations + y.size + 1
@@ -306,7 +287,7 @@ def _fit_in_noise_rounds(
             problem, y, directions, temperature, steps, enough, is_free=is_free
         )
         evaluations += used
-        if not problem.force.any() or chi2_per_dof(problem, y) > HOPELESS_CHI2:
+        if not problem.force.any():
             break
         before, problem = problem, refresh_noise(problem, y)
         if abs(before.force.sum() - problem.force.sum()) <= _SAME_LEVEL * before.force.sum():

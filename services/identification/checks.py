@@ -5,7 +5,6 @@ sound and on faulty crossings (studies/faults.md). `signal_checks` holds the che
 signals alone.
 """
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -139,9 +138,6 @@ class Fit(NamedTuple):
     """Amplitude of the mismatch on the bridge over that off it, in waves of a metre."""
     tandem_friction: float = 0.0
     """Friction of a tandem's springs over their load, where they do not share it."""
-    fits_off_bridge: bool | None = None
-    """Whether truck and road alone explain the rows off the bridge; None where that was not
-    judged."""
 
 
 def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
@@ -257,7 +253,6 @@ def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
     if suspicious and _is_only_noise(fit, found):
         reasons.append(Reason.NOISE_ABOVE_DECLARED)
     elif suspicious or fit.chi2_per_dof > _GOOD_CHI2:
-        reasons += _place_of_misfit(fit, suspicious)
         if fit.chi2_per_dof > _GOOD_CHI2:
             reasons.append(Reason.MODEL_MISFIT)
         else:
@@ -265,16 +260,6 @@ def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
     if fit.chi2_per_dof < _SMALLEST_CHI2:
         reasons.append(Reason.NOISE_BELOW_DECLARED)
     return reasons
-
-
-def _place_of_misfit(fit: Fit, suspicious: Iterable[tuple[int, int, int]]) -> list[Reason]:
-    """Return on which side of the bridge's ends the cause of a misfit lies, if that is known."""
-    if fit.fits_off_bridge:
-        return [Reason.MISFIT_ON_BRIDGE]
-    is_off = any(stretch != ON for _, stretch, _ in suspicious)
-    if fit.fits_off_bridge is False and is_off:
-        return [Reason.MISFIT_OFF_BRIDGE]
-    return []
 
 
 def _slack(fit: Fit, kind: int, stretch: int, band: int) -> float:

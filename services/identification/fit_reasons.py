@@ -52,11 +52,7 @@ def reasons_of_fit(
     names, densities = middle_names(data.vehicle), data.sensor.noise_density_ug_per_rthz
     slipped = steps_of_channels(names, fit)
     reasons = [*slipped, *reasons_after_fit(data, fit)]
-    is_on_bridge = Reason.MISFIT_ON_BRIDGE in reasons
-    if is_on_bridge:
-        # Off the bridge every channel was as it should be: the fit on it has invented the step.
-        reasons = reasons[len(slipped) :]
-    elif found.ending is not Termination.CONVERGED:
+    if found.ending is not Termination.CONVERGED:
         reasons.append(Reason.NOT_CONVERGED)
     axles = undeclared_axles(data.vehicle, acceleration, step_s, is_doubted=bool(reasons))
     coarse = coarse_converters(names, densities, acceleration, step_s)
@@ -83,10 +79,8 @@ def _fit(data: CrossingData, found: Optimum) -> Fit:
     # A profile mismatch biases the truck as far as it is known.
     moved = mismatch_bias(found)
     led = np.hypot(1.0, MISMATCH_BIAS_SPREAD * moved)
-    # What does not fit on the bridge distorts the truck.
-    truck = y if found.off_bridge_y is None else found.off_bridge_y
     prior_z = {
-        row.name: float(truck[k] / led[k])
+        row.name: float(y[k] / led[k])
         for k, row in enumerate(estimated)
         if row.part == parameters.TRUCK
     }
@@ -96,7 +90,7 @@ def _fit(data: CrossingData, found: Optimum) -> Fit:
         rows.every * rows.step_s,
         rear_axle_chainage_m(problem, y),
         found.chi2_per_dof,
-        prior_z | {"wheelbase": float(truck[where.wheelbase])},
+        prior_z | {"wheelbase": float(y[where.wheelbase])},
         float(problem.receiver_rows[-1, -1] * y[where.offset]),
         np.sqrt(np.diag(covariance)[where.elements]),
         bool(problem.mismatch.level_m3.any()),
@@ -110,5 +104,4 @@ def _fit(data: CrossingData, found: Optimum) -> Fit:
         float(np.abs(moved).max()),
         pavement_ratio(problem.mismatch),
         tandem_friction(problem, y),
-        found.fits_off_bridge,
     )

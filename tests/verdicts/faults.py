@@ -65,9 +65,6 @@ class Fault(NamedTuple):
     rear_road: float = 1.0
     """The rear wheels' road over the front wheels'."""
     second_vehicle_kg: float = 0.0
-    second_vehicle_gap_m: float | None = None
-    """Its distance behind the truck's front axle, at the same speed; negative: it drives ahead.
-    None: it comes the other way."""
     noise: float = 1.0
     """True over declared."""
     sensor: dict[str, Any] = {}  # noqa: RUF012 - of pre_core.physics.sensors.Accelerometer, never changed
@@ -214,7 +211,7 @@ def _with_second_vehicle(
     fine_hz: float,
     settle: int,
 ) -> WheelRoad:
-    """The bridge sinks under another vehicle too, which meets the truck or drives along with it.
+    """The bridge sinks under another vehicle too, which comes the other way and meets the truck.
 
     The bridge is linear: what the other vehicle adds to its deflection is added to the road that
     the truck's wheels feel. What the truck does to the other vehicle is left out.
@@ -232,19 +229,15 @@ def _with_second_vehicle(
     )
     span = float(beam.element_lengths_m.sum())
     sign = 1.0 if truth.forward else -1.0
-    if fault.second_vehicle_gap_m is None:
-        # It meets the truck a little past the middle.
-        heading = -sign
-        meet = int(np.argmin(np.abs(motion.position_m - span * (0.5 + 0.1 * sign))))
-        speed = heading * 12.0
-        start = motion.position_m[meet] - speed * meet / fine_hz
-        own = forward.constant_speed(start, speed, motion.position_m.size, 1.0 / fine_hz)
-    else:
-        heading = sign
-        own = motion._replace(position_m=motion.position_m - sign * fault.second_vehicle_gap_m)
+    # It meets the truck a little past the middle.
+    meet = int(np.argmin(np.abs(motion.position_m - span * (0.5 + 0.1 * sign))))
+    steps = motion.position_m.size
+    speed = -sign * 12.0
+    start = motion.position_m[meet] - speed * meet / fine_hz
+    own = forward.constant_speed(start, speed, steps, 1.0 / fine_hz)
     low, high = np.floor(own.position_m.min() - 5.0), np.ceil(own.position_m.max() + 5.0)
     raw = iso_8608_profile(low, high, 0.01, truth.road_class, truth.seed + 1)
-    felt = under_wheels(contact_patch_average(raw, 0.2), own, other.wheelbase_m, int(heading))
+    felt = under_wheels(contact_patch_average(raw, 0.2), own, other.wheelbase_m, int(-sign))
     run = forward.simulate(other, beam, own, felt, 1.0 / fine_hz, modes=_MODES)
     x = np.linspace(0.0, span, 61)
     deflection = forward.deflection_m(beam, run, x)

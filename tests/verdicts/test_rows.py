@@ -93,31 +93,6 @@ def test_a_misfit_in_noise_that_is_too_large_is_a_misfit() -> None:
     assert Reason.MODEL_MISFIT in reasons_after_fit(crossing(), fit(white))
 
 
-@pytest.mark.parametrize(
-    ("fits", "is_on", "named"),
-    [
-        (True, True, [Reason.MISFIT_ON_BRIDGE]),
-        (False, False, [Reason.MISFIT_OFF_BRIDGE]),
-        (False, True, []),
-        (None, True, []),
-        (None, False, []),
-    ],
-)
-def test_a_misfit_is_said_to_be_on_the_bridge_or_off_it(
-    fits: bool | None, is_on: bool, named: list[Reason]
-) -> None:
-    white = normals()
-    there = on_bridge() if is_on else 1.0 - on_bridge()
-    white[:, ROAD] += 4.0 * there * np.sin(2.0 * np.pi * 3.3 * STEP_S * np.arange(ROWS))
-    left_over = fit(white, fits_off_bridge=fits)
-    assert reasons_after_fit(crossing(), left_over) == [*named, Reason.MODEL_MISFIT]
-
-
-@pytest.mark.parametrize("fits", [True, False, None])
-def test_white_rows_are_no_misfit_anywhere(fits: bool | None) -> None:
-    assert reasons_after_fit(crossing(), fit(normals(), fits_off_bridge=fits)) == []
-
-
 def test_rows_of_a_short_stretch_are_not_overrated() -> None:
     """Ten rows before the bridge: a cell of a few numbers needs much to stand out."""
     place = np.concatenate([np.linspace(-0.5, -0.01, 10), np.linspace(0.0, 30.0, ROWS - 10)])
