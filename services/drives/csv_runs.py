@@ -23,8 +23,10 @@ from services.finding.placed import rates_hz
 
 _log = logging.getLogger(__name__)
 _MAX_SHOWN = 3
-_OTHER_FORM = re.compile(r": line [12]: |holds no accel_NN.csv|is not UTF-8 text")
-"""Errors of the exact reader for files of another form."""
+_OTHER_FORM = re.compile(
+    r": line 1: |: line 2: (?!\S+ is ([-+.\d]|inf|nan))|holds no accel_NN.csv|is not UTF-8 text"
+)
+"""Errors of the exact reader for files of another form; in line 2 may be words, such as units."""
 
 
 class HowToRead(NamedTuple):

@@ -83,9 +83,16 @@ def _ends(outlook: PlanForecast) -> str:
 
 def _of_the_others(found: SurveyForecast) -> str:
     planned = found.planned
-    # A loss in one of fewer, longer elements is more damage: it answers another question.
+    # A loss in one of fewer, longer elements is more damage: it answers another question. The
+    # forecast of a tandem is more accurate than its crossings are (studies/tandems.md).
     elements = planned.plan.site.bridges[0].elements
-    same = [one for one in found.others if one.plan.site.bridges[0].elements == elements]
+    has_tandem = planned.plan.site.vehicles[0].tandem is not None
+    same = [
+        one
+        for one in found.others
+        if one.plan.site.bridges[0].elements == elements
+        and (has_tandem or one.plan.site.vehicles[0].tandem is None)
+    ]
     better = sorted((one for one in same if _helps(one, planned)), key=_rank)
     if not better:
         return "No other change that was tried here helps much."

@@ -446,7 +446,7 @@ def test_a_truck_that_is_quiet_gets_a_new_file_when_it_comes_back(
     writer = FileWriter(place(tmp_path))
     writer.put(info("truck-1"))
     writer.put(next(fixes(1)))
-    wait_for(lambda: writer.written == 2 and writer.open_files() == 0)
+    wait_for(lambda: writer.written == 2 and writer.take_figures()["files"] == 0)
     writer.put(next(fixes(1, first=1)))
     writer.finish("done", {})
     paths = list(tmp_path.glob("live/*/*.mcap"))

@@ -124,9 +124,11 @@ def check_overlap(
             )
     name = Path(source).name
     if not 0 < abs(quarters) <= _MAX_QUARTERS or abs(apart_s - 900.0 * quarters) > 60.0:
+        hint = _leap_hint(apart_s)
+        option = " (--map)" if hint else ""
         raise InputError(
             f"{part.sheet.path}: begins {apart_s:+.3f} s from {name}, the clocks of both must "
-            f"agree{_leap_hint(apart_s)}; offset_s in [file.time] of a map (--map) corrects one"
+            f"agree{hint}; offset_s in [file.time] of a map{option} corrects one"
         )
     raise InputError(
         f"{part.sheet.path}: begins {apart_s:+.3f} s from {name}, {abs(quarters) / 4:g} h: another "
