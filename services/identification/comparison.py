@@ -192,9 +192,9 @@ def describe_comparison(
     level: ElementState | None = None,
     language: Language = ENGLISH,
 ) -> list[str]:
-    """Return sentences on the comparison; only resolved elements are said to agree.
+    """Return sentences on the comparison; of unresolved elements they state only that.
 
-    `unresolved` are the numbers of the others; with them the `level` of the bridge is stated.
+    `unresolved` are their numbers; with them the `level` of the bridge is stated.
     """
     if found is None or not unresolved:
         return sentences(found, language)
@@ -204,6 +204,9 @@ def describe_comparison(
         either = f" {language.text('or')} ".join(map(str, others))
         wordings.append(language.text("may_be_beside", numbers=either))
     wordings.append(_not_resolved(len(found.elements), unresolved, language))
+    resolved = tuple(e for e in found.rest if e.number not in unresolved)
+    if resolved:
+        wordings.append(language.text("rest.resolved", loss=_smallest_seen(resolved)))
     if level is not None:
         std = 100.0 * level.std / level.mean
         wordings.append(language.text("level", mean=level.mean, std=std))
@@ -232,10 +235,19 @@ def sentences(found: Comparison | None, language: Language = ENGLISH) -> list[st
     wordings += [_change("stiffer", found, e, language) for e in found.stiff]
     if found.rest:
         farthest = max(abs(1.0 - e.ratio) for e in found.rest)
-        within = max(1, int(np.ceil(100.0 * farthest - 1e-6)))
+        values = {"within": max(1, _per_cent_up(farthest)), "loss": _smallest_seen(found.rest)}
         which = "rest" if wordings else "all"
-        wordings.append(language.text(f"{which}.{found.reference}", within=within))
+        wordings.append(language.text(f"{which}.{found.reference}", **values))
     return wordings
+
+
+def _smallest_seen(elements: Sequence[Element]) -> int:
+    """Return the loss in per cent that would have been clear in each of the elements."""
+    return _per_cent_up(max(element.visible_loss for element in elements))
+
+
+def _per_cent_up(share: float) -> int:
+    return int(np.ceil(100.0 * share - 1e-6))
 
 
 def _change(how: str, found: Comparison, element: Element, language: Language) -> str:

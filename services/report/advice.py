@@ -21,8 +21,10 @@ def next_steps(report: BridgeReport, language: Language) -> Iterator[str]:
         case "sound":
             yield language.text("advice.sound")
         case "open":
-            yield language.text("advice.open")
-            yield language.text("advice.open_truck")
+            yield language.text("advice.not_ruled_out")
+            if report.view.comparison is not None:
+                yield language.text("advice.open")
+                yield language.text("advice.open_truck")
         case kind:
             yield language.text("advice.rejected" if kind == "nothing" else "advice.suspect")
             yield from advice_of_state(report, language)

@@ -17,7 +17,7 @@ from services.execution.blas import one_blas_thread
 from services.history.bridge_history import BridgeHistory, bridge_history
 from services.history.history_store import bridges_of
 from services.history.periods import Unit
-from services.identification.comparison import Estimate, compare
+from services.identification.comparison import Comparison, Estimate, compare
 from services.viewer.baseline import named_baseline, stored_baseline
 from services.viewer.bridge_view import BridgeView, describe_bridge, view_of_bridge
 
@@ -25,6 +25,8 @@ _LATEST_S = 7_258_118_400.0
 """The year 2200, as a Unix time in s."""
 _LARGEST_DEVIATION = 4.0
 """Standard deviations beyond which crossings do not agree."""
+LARGEST_MISSED_LOSS = 0.2
+"""Visible loss of an element above which no finding is `sound`: the one that surveys plan for."""
 _MAX_REASONS = 3
 """Maximum number of reasons in the box; all of them are listed below it."""
 
@@ -33,7 +35,7 @@ class BridgeFinding(NamedTuple):
     """The conclusion, with its certainty."""
 
     kind: str
-    """One of `weak`, `sound`, `open` (unresolved elements), `doubtful` and `nothing`."""
+    """One of `weak`, `sound`, `open` (a loss may have been missed), `doubtful` and `nothing`."""
     headline: str
     sentences: tuple[str, ...]
 
@@ -233,7 +235,7 @@ def _finding(
         headline = language.text("finding.doubtful")
         return BridgeFinding("doubtful", headline, (*wording, *because))
     if view.comparison is None:
-        return BridgeFinding("sound", language.text("finding.incomparable"), wording)
+        return BridgeFinding("open", language.text("finding.incomparable"), wording)
     weak = view.comparison.weak
     if weak and view.ambiguous_neighbours:
         numbers = language.listed([str(one.number) for one in weak])
@@ -241,10 +243,35 @@ def _finding(
         return BridgeFinding("weak", headline, wording)
     if weak:
         return BridgeFinding("weak", language.choice("finding.weak", len(weak)), wording)
-    if 2 * len(view.unresolved) > len(view.comparison.elements):
-        return BridgeFinding("open", language.text("finding.open"), wording)
-    which = "finding.partly" if view.unresolved else "finding.none"
-    return BridgeFinding("sound", language.text(which), wording)
+    missed = _why_open(view, view.comparison, language)
+    if missed is None:
+        return BridgeFinding("sound", language.text("finding.none"), wording)
+    return BridgeFinding("open", missed, (*wording, _seen(view.comparison, language)))
+
+
+def _why_open(view: BridgeView, found: Comparison, language: Language) -> str | None:
+    """Return why a loss may have been missed; None where one of each element would be clear."""
+    unresolved = sorted(view.unresolved)
+    if 2 * len(unresolved) > len(found.elements):
+        return language.text("finding.open")
+    if unresolved:
+        numbers = language.listed([str(number) for number in unresolved])
+        return language.choice("finding.partly", len(unresolved), elements=numbers)
+    if max(one.visible_loss for one in found.elements) > LARGEST_MISSED_LOSS:
+        return language.text("finding.coarse", limit=100.0 * LARGEST_MISSED_LOSS)
+    return None
+
+
+def _seen(found: Comparison, language: Language) -> str:
+    """Return from which loss on elements would have been called weak: the best and the worst."""
+    best, *_, worst = sorted(found.elements, key=lambda one: one.visible_loss)
+    return language.text(
+        "finding.seen",
+        low=100.0 * best.visible_loss,
+        best=best.number,
+        high=100.0 * worst.visible_loss,
+        worst=worst.number,
+    )
 
 
 def _reasons_of_state(

@@ -244,9 +244,11 @@ def _caveats(report: BridgeReport, language: Language) -> Iterator[Html]:
     yield tag("p", language.text("note.how_to_read"), class_="note how")
     if comparison is None:
         return
-    notes = [_visible(comparison, language)]
+    notes = [language.text("note.change")]
     if comparison.reference == "others":
-        notes.insert(0, language.text("note.no_baseline", level=comparison.level))
+        notes = [language.text("note.no_baseline", level=comparison.level)]
+    if report.finding.kind != "open":  # there the finding itself states it
+        notes.append(_visible(comparison, language))
     yield tag("p", " ".join(notes), class_="note")
 
 

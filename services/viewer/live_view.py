@@ -23,12 +23,18 @@ from schemas.signals import AccelBatch, GnssFix, decode_accel, decode_gnss
 from schemas.site import Site
 from services.bus.realm_listener import BusMessage
 from services.common.geodesy import to_chainage
-from services.identification.comparison import compare, estimate_of_state, sentences
+from services.identification.comparison import (
+    compare,
+    describe_comparison,
+    estimate_of_state,
+    unresolved_elements,
+)
 from services.viewer.crossing_view import (
     CrossingView,
     ElementGeometry,
     FloatArray,
     comparison_of,
+    describe_crossing,
     elements_of_result,
     summary_line,
     view_of_crossing,
@@ -228,7 +234,9 @@ class LiveView:
             log_trend_style(self._recording, trend_root(bridge), nominal.size)
         log_trend(self._recording, trend_root(bridge), time_ns, estimate, nominal)
         used = len(state.crossings_used)
-        wording = state.finding or " ".join(sentences(compared))
+        unresolved = unresolved_elements(state.elements.values())
+        described = describe_comparison(compared, unresolved, state.level)
+        wording = state.finding or " ".join(described)
         self._findings[bridge] = f"**All {used}:** {wording}" if used > 1 else ""
         moment_ns = max(time_ns, self._lanes.end_ns(bridge))
         self._draw_text(bridge, moment_ns)
@@ -277,7 +285,8 @@ class LiveView:
         if on_site is not None and view.rigidity_nm2 is not None:
             ratios = view.rigidity_nm2 / view.nominal_nm2
             self._draw_bridge(on_site.on_map, ratios, moment_ns, is_doubtful(view))
-        return "" if compared is None else f"\n\n{' '.join(sentences(compared))}"
+        wording = describe_crossing(view, compared)
+        return f"\n\n{' '.join(wording)}" if wording else ""
 
     def _draw_text(self, bridge: str, moment_ns: int) -> None:
         texts = (self._drawn.get(bridge, (0.0, ""))[1], self._findings.get(bridge, ""))

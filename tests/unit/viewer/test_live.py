@@ -250,7 +250,20 @@ def test_a_result_is_drawn_and_the_next_takes_its_place(live: Live, site: Site) 
     texts = values(rows(chunks, "said/bridge-1"), "TextDocument:text")
     assert "No result yet" in texts[0]
     assert "60 % less stiff than the other elements" in texts[1]
-    assert "No element stands out" in texts[2]
+    assert "No element differs clearly from the others" in texts[2]
+
+
+def test_unresolved_elements_of_a_result_are_not_said_to_be_alike(live: Live, site: Site) -> None:
+    wide = results_of(site, some_crossing("a"), ratios=np.ones(7)).crossings[0]
+    content = wide.model_dump(mode="json")
+    for n in (1, 7):
+        content["parameters"][f"EI_{n}"] |= {"std": 0.5 * content["parameters"][f"EI_{n}"]["mean"]}
+    level = {"unit": "1", "mean": 0.97, "std": 0.1, "q025": 0.8, "q50": 0.97, "q975": 1.2}
+    content["derived"] |= {"ei_level": level}
+    live.hears("bridge", "estimate", estimate(CrossingResult.model_validate(content)))
+    text = values(rows(live.drawn(), "said/bridge-1"), "TextDocument:text")[-1]
+    assert "2 of 7 elements not resolved" in text
+    assert "differs clearly" not in text
 
 
 def test_rejected_crossing_names_reason_and_source_of_numbers(live: Live, site: Site) -> None:
