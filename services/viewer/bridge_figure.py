@@ -38,6 +38,7 @@ from services.viewer.drawing import (
     mark_bridge,
     simplify_axes,
     simplify_numbers,
+    top_above_labels,
     write_centred,
     write_figure,
 )
@@ -87,12 +88,12 @@ def _draw_panel(axes: Axes, bridge: BridgeView, language: Language) -> None:
     axes.set_ylabel(language.text("figure.ei"))
     label = language.text("figure.nominal")
     axes.stairs(nominal, bridge.edges_m, baseline=None, label=label, **NOMINAL_LINE)
-    highest = float(nominal.max())
+    top = 1.1 * float(nominal.max())
     if bridge.estimate is None:
         write_centred(axes, _why_nothing(bridge))
     else:
-        highest = max(highest, _draw_state(axes, bridge, language))
-    axes.set_ylim(0.0, 1.1 * highest)
+        top = max(top, _draw_state(axes, bridge, language))
+    axes.set_ylim(0.0, top)
     legend_beside_title(axes)
     simplify_axes(axes)
     simplify_numbers(axes, language)
@@ -103,7 +104,7 @@ def _draw_panel(axes: Axes, bridge: BridgeView, language: Language) -> None:
 
 
 def _draw_state(axes: Axes, bridge: BridgeView, language: Language) -> float:
-    """Draw the state, the baseline beside it, and single crossings; return the highest."""
+    """Draw the state, the baseline next to it and single crossings; return the axis' end."""
     assert bridge.estimate is not None  # noqa: S101 - its caller checked
     mean, low, high = (column / 1e9 for column in bridge.estimate[:3])
     highest, places = float(high.max()), bar_places(bridge.edges_m)
@@ -136,7 +137,7 @@ def _draw_state(axes: Axes, bridge: BridgeView, language: Language) -> float:
         for element in weak
     }
     label_losses(axes, places, low, high, losses)
-    return highest
+    return max(1.1 * highest, top_above_labels(axes, low, high, losses))
 
 
 def _draw_before(axes: Axes, bridge: BridgeView, places: BarPlaces, language: Language) -> float:

@@ -115,10 +115,7 @@ def _draw_intervals(
             zorder=5,
             label=_label_of(place, crossings, language),
         )
-        # Intervals of unresolved elements reach far beyond the picture.
-        resolved = [n for n in range(high.size) if n + 1 not in crossing.unresolved]
-        shown = high[resolved] if resolved else crossing.rigidity_nm2 / 1e9
-        highest = max(highest, float(shown.max()), float(crossing.rigidity_nm2.max()) / 1e9)
+        highest = max(highest, float(high.max()), float(crossing.rigidity_nm2.max()) / 1e9)
     return highest
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -53,6 +53,10 @@ _PLATE: dict[str, Any] = {
     "linewidth": 0,
 }
 """Box behind a label, which hides the lines that it would stand on."""
+_LABEL_PT = 16.0
+"""Height of a label with its box, in points."""
+_VALUE_PT, _LOSS_PT, _LOSS_ABOVE_VALUE_PT = 5.0, 6.0, 21.0
+"""Distances of labels from the top of an interval, in points."""
 _CHARACTERS = 118
 """Maximum length of a line of reasons between the figure's edges."""
 
@@ -229,7 +233,7 @@ def label_losses(
         axes.annotate(
             text,
             (places.centres_m[number - 1], high[number - 1]),
-            xytext=(0, 21 if above[number - 1] else 6),
+            xytext=(0, _LOSS_ABOVE_VALUE_PT if above[number - 1] else _LOSS_PT),
             textcoords="offset points",
             ha="center",
             fontsize=8 if high.size > 11 else 9.5,
@@ -249,7 +253,7 @@ def label_bars(
         axes.annotate(
             text,
             (centre, high[number] if above[number] else low[number]),
-            xytext=(0, 5 if above[number] else -10),
+            xytext=(0, _VALUE_PT if above[number] else -10),
             textcoords="offset points",
             ha="center",
             va="bottom" if above[number] else "top",
@@ -269,6 +273,22 @@ def label_bars(
             color=MUTED,
             zorder=7,
         )
+
+
+def top_above_labels(
+    axes: Axes, low: FloatArray, high: FloatArray, labelled: Iterable[int] = ()
+) -> float:
+    """Return the end of a vertical axis from 0 below which all labels above intervals stay.
+
+    `labelled` are the numbers of the elements with a loss above their interval.
+    """
+    above = np.array(_are_low(low, high))
+    needed_pt = np.where(above, _VALUE_PT + _LABEL_PT, 0.0)
+    for number in labelled:
+        start_pt = _LOSS_ABOVE_VALUE_PT if above[number - 1] else _LOSS_PT
+        needed_pt[number - 1] = start_pt + _LABEL_PT
+    height_pt = axes.get_window_extent().height * 72.0 / axes.figure.dpi
+    return float(np.max(high / (1.0 - needed_pt / height_pt)))
 
 
 def _are_low(low: FloatArray, high: FloatArray) -> Sequence[bool]:

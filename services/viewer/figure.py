@@ -40,6 +40,7 @@ from services.viewer.drawing import (
     legend_beside_title,
     mark_bridge,
     simplify_axes,
+    top_above_labels,
     write_centred,
     write_figure,
 )
@@ -130,24 +131,24 @@ def _draw_rigidity(axes: Axes, crossing: CrossingView, truth: list[float] | None
     axes.set_title("Flexural rigidity EI")
     axes.set_ylabel("EI (GN·m²)")
     axes.stairs(nominal, edges, baseline=None, label="nominal", **NOMINAL_LINE)
-    highest = float(nominal.max())
+    top = 1.1 * float(nominal.max())
     if truth is not None:
         true_values = np.asarray(truth) * nominal
         # To the side of the interval's line, which may be shorter than the marker.
         beside = centres - 0.22 * np.diff(edges)
         axes.plot(beside, true_values, label="truth", zorder=4, **TRUTH_MARKER)
-        highest = max(highest, float(true_values.max()))
+        top = max(top, 1.1 * float(true_values.max()))
     if crossing.rigidity_nm2 is None:
         _write_rejection(axes, crossing)
     else:
-        highest = max(highest, _draw_estimate(axes, crossing, crossing.rigidity_nm2 / 1e9))
-    axes.set_ylim(0.0, 1.1 * highest)
+        top = max(top, _draw_estimate(axes, crossing, crossing.rigidity_nm2 / 1e9))
+    axes.set_ylim(0.0, top)
     legend_beside_title(axes)
     add_ratio_axis(axes, nominal)
 
 
 def _draw_estimate(axes: Axes, crossing: CrossingView, estimate: FloatArray) -> float:
-    """Draw bars, intervals and labels in GN·m²; return the highest value drawn."""
+    """Draw bars, intervals and labels in GN·m²; return the end of the vertical axis."""
     edges = crossing.element_edges_m
     doubtful = crossing.verdict != "good" or not crossing.interval_has_meaning
     compared = comparison_of(crossing)
@@ -167,7 +168,7 @@ def _draw_estimate(axes: Axes, crossing: CrossingView, estimate: FloatArray) -> 
     label_bars(axes, places, lowest, upper, [f"{ratio:.3f}" for ratio in ratios])
     losses = {one.number: f"{100.0 * (1.0 - one.ratio):.0f} % less" for one in weak}
     label_losses(axes, places, lowest, upper, losses)
-    return float(upper.max())
+    return max(1.1 * float(upper.max()), top_above_labels(axes, lowest, upper, losses))
 
 
 def _draw_profiles(

@@ -7,6 +7,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
@@ -16,9 +17,11 @@ from schemas.results import CrossingResult, Results
 from schemas.site import Site
 from schemas.site_file import load_site
 from services.cli import main as cli
+from services.common.language import language_of
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.bridge_view import BridgeView, view_of_bridge
 from services.viewer.crossing_view import comparison_of, view_of_crossing
+from services.viewer.crossings_figure import draw_crossings
 from services.viewer.drawing import STYLE
 from services.viewer.figure import draw_crossing
 from services.viewer.pictures import write_pictures
@@ -202,3 +205,67 @@ def test_what_is_not_resolved_is_an_empty_bar_and_agrees_with_nothing(site: Site
     colours = ratio_colours(ratios, 7, doubtful=False)
     assert colours[0] == colours[6] == rgb(MUTED)
     assert colours[1] != rgb(MUTED)
+
+
+def wide_state(site: Site, *crossings: dict[str, Any]) -> Results:
+    """A state and crossings as of twin tyres: all but one element reach to 2.4 times nominal."""
+    found = results_of(site, *crossings, used="a").model_dump(mode="json")
+    nominal = site.bridges[0].nominal_flexural_rigidity_nm2[0]
+    for n in range(1, 8):
+        wide = {"mean": 1.1 * nominal, "std": 0.5 * nominal, "q025": 0.3 * nominal}
+        wide["q975"] = (2.0 + 0.13 * (n % 4)) * nominal
+        if n == 4:
+            wide = {"mean": 0.4 * nominal, "std": 0.02 * nominal}
+            wide |= {"q025": 0.36 * nominal, "q975": 0.44 * nominal}
+        found["bridges"][site.bridges[0].id][f"EI_{n}"] |= wide
+        for crossing in found["crossings"]:
+            crossing["parameters"][f"EI_{n}"] |= wide
+    level = {"unit": "1", "mean": 0.97, "std": 0.1, "q025": 0.8, "q50": 0.97, "q975": 1.2}
+    for crossing in found["crossings"]:
+        crossing["derived"] |= {"ei_level": level}
+    return Results.model_validate(found)
+
+
+@pytest.mark.parametrize("code", ["en", "de"])
+@pytest.mark.parametrize("with_heading", [True, False])
+def test_values_above_long_intervals_keep_off_title_and_legend(
+    site: Site, code: str, with_heading: bool
+) -> None:
+    results = wide_state(site, some_crossing("a"), some_crossing("b", entry=60.0))
+    view = view_of_bridge(site.bridges[0], results, None)
+    figure = draw_bridge(view, with_heading=with_heading, language=language_of(code))
+    assert_words_apart(figure)
+    axes = figure.axes[0]
+    top = axes.get_window_extent().y1
+    values = [text for text in axes.texts if text.get_text()[:1].isdigit()]
+    assert len(values) == 8
+    assert all(text.get_window_extent().y1 <= top for text in values)
+
+
+def test_values_above_long_intervals_of_one_crossing_keep_off_the_title(site: Site) -> None:
+    crossing = wide_state(site, some_crossing("a")).crossings[0]
+    view = view_of_crossing(crossing, site.bridges[0])
+    figure = draw_crossing(view, element_truth=None, road_truth=None)
+    assert_words_apart(figure)
+    top = figure.axes[0].get_window_extent().y1
+    values = [text for text in figure.axes[0].texts if text.get_text()[:1].isdigit()]
+    assert len(values) == 8
+    assert all(text.get_window_extent().y1 <= top for text in values)
+
+
+def test_no_interval_of_a_crossing_is_cut(site: Site) -> None:
+    results = wide_state(site, some_crossing("a"), some_crossing("b", entry=60.0))
+    views = [(n, view_of_crossing(one, site.bridges[0])) for n, one in enumerate(results.crossings)]
+    assert views[0][1].unresolved
+    figure = draw_crossings(views)
+    ends = [
+        point[1]
+        for lines in figure.axes[0].collections
+        if isinstance(lines, LineCollection)
+        for segment in lines.get_segments()
+        for point in segment
+    ]
+    low, high = figure.axes[0].get_ylim()
+    assert len(ends) == 2 * 2 * 7
+    assert low < min(ends) < max(ends) < high
+    assert_words_apart(figure)
