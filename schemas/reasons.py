@@ -174,7 +174,7 @@ class LeftOutReason(StrEnum):
 LEFT_OUT_TEXTS: Final[dict[str, str]] = {
     LeftOutReason.SUSPECT: "suspect",
     LeftOutReason.DISAGREES: "disagrees with the others beyond its uncertainty",
-    LeftOutReason.OTHER_MODEL: "was identified with other elements or other unknowns",
+    LeftOutReason.OTHER_MODEL: "was identified with other elements or parameters",
     LeftOutReason.NO_LIKELIHOOD: "an older result, without what fusion needs",
     LeftOutReason.NOT_FUSED: "this method's results are not fused",
 }
