@@ -11,7 +11,7 @@ import numpy as np
 
 
 def _put_off(*names: str) -> None:
-    """Let parts of NumPy be imported when somebody looks into them."""
+    """Import parts of NumPy at their first use."""
     for name in names:
         spec = None if name in sys.modules else find_spec(name)
         if spec is None or spec.loader is None:

@@ -1,4 +1,4 @@
-"""Metrics for Prometheus: the figures of the messages `health` under names that do not change.
+"""Metrics for Prometheus: the figures of `health` messages under names that do not change.
 
 Text of exposition format 0.0.4, https://prometheus.io/docs/instrumenting/exposition_formats/.
 """
@@ -105,7 +105,7 @@ class ServiceFigures(NamedTuple):
 
 
 def exposition(services: Iterable[ServiceFigures]) -> str:
-    """Return the metrics of services; figures of other names are left out."""
+    """Return the text of all metrics of the services; other figures are omitted."""
     known = sorted(services, key=lambda one: (one.realm, one.service))
     lines: list[str] = []
     for metric in METRICS:

@@ -1,4 +1,4 @@
-"""Residuals off the bridge: where they are, and the mismatch of the profiles there."""
+"""Residuals off the bridge: their location, and the profile mismatch estimated from them."""
 
 import numpy as np
 

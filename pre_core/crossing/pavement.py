@@ -1,4 +1,4 @@
-"""Mismatch on the bridge, whose pavement is another one than that of the road.
+"""Profile mismatch on the bridge, whose pavement differs from the road's.
 
 Relative to the road's, the amplitude of the mismatch on the bridge is
 
@@ -27,7 +27,7 @@ from pre_core.physics.bridge import FloatArray
 RATIO_SPREAD, TILT_SPREAD = 0.7, 0.12
 """Standard deviations of r and t. Decks were 2.5 to 3.8 times as rough as the road before them."""
 _SHORT_CYCLES_PER_M = (0.3, 4.0)
-"""Waves on the bridge that no deflection resembles, and that tyres feel."""
+"""Wave numbers that no deflection of the bridge has, and that tyres do not average out."""
 _JOINT_M = 0.5
 """Distance from an end of the deck within which a joint acts."""
 _BLEND_M = 0.5
@@ -36,11 +36,11 @@ _PASSES, _LONGEST_STEP = 40, 0.5
 _CONVERGED = 1e-4
 _KNOT_M = 0.1
 _KNOTS = np.arange(-3.0, 4.0)
-"""Middles of cubic splines at an end, in units of their spacing; a step is added to them."""
+"""Centres of the cubic splines at an end, in units of their spacing; a step is added to them."""
 _JOINT_SIZE_M = 1e-3
-"""Mismatch at a joint, relative to which waves without effect on the residuals are kept."""
+"""Size of a joint's mismatch; local waves that even with it do not affect the residuals stay."""
 _CLEAR_JOINT = 8.0
-"""Excess of the local power at the ends, in standard deviations of chance, that is a joint."""
+"""Excess of local power at the ends above which it is a joint, in standard deviations of chance."""
 
 
 def estimate_pavement(
@@ -120,7 +120,7 @@ def fit_ratio(
 
 
 def parts_of(road: Mismatch, count: int) -> list[tuple[Mismatch, float]]:
-    """Return the mismatch off and on the bridge, with their number among `count` residuals."""
+    """Return the mismatch off and on the bridge, each with its share of `count` residuals."""
     pavement = road.pavement
     if pavement is None:
         return [(road, float(count))]

@@ -1,4 +1,4 @@
-"""Spectra of suspension noise: friction and nonlinear dampers, in bumps of known shape."""
+"""Spectra of suspension noise, due to friction and nonlinear dampers, as bumps of known shape."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ FORCE_SHAPES = _FORCE_CENTRES_HZ.size
 """Number of bumps, a few hertz wide, in the spectrum of the suspension noise: that of dry friction
 falls by six decades from the body's bounce to the residuals' highest frequency."""
 FORCE_MEMORY_S = 0.3
-"""End of the suspension noise's covariance, which gives the bumps their width."""
+"""Lag in s beyond which the suspension noise has no covariance; it sets the bumps' width."""
 
 
 def force_rms_n(force: FloatArray) -> FloatArray:
@@ -31,7 +31,7 @@ def force_rms_n(force: FloatArray) -> FloatArray:
 
 
 def force_shapes(omega: FloatArray) -> FloatArray:
-    """Return spectra (shapes, f) of B(t) cos(omega_k t), B the Bohman window, a half at their tops.
+    """Return the spectra (shapes, f) of B(t) cos(omega_k t), B the Bohman window; maxima 1/2.
 
     B is the half wave cos(pi t/T) convolved with itself, so that its spectrum is a square.
     """
@@ -40,7 +40,7 @@ def force_shapes(omega: FloatArray) -> FloatArray:
 
 
 def _bohman(omega: FloatArray) -> FloatArray:
-    """Return the spectrum of the Bohman window ending at +-`FORCE_MEMORY_S`, a half at zero."""
+    """Return the spectrum of the Bohman window ending at +-`FORCE_MEMORY_S`; its maximum is 1/2."""
     turn = omega * FORCE_MEMORY_S
     apart = 1.0 - (turn / np.pi) ** 2
     near = np.abs(apart) < 1e-6

@@ -1,4 +1,4 @@
-"""Kernels of a crossing of a truck whose tandem is compared, and of any number of wheels.
+"""Kernels for a truck whose tandem axles are compared, and for any number of wheels.
 
 The two axles of the tandem take the places of the front and the rear axle of `residuals`; the
 truck's front axle, `Lead`, is a third load ahead of them. Its own inertia force m_u z'' is small:

@@ -1,4 +1,4 @@
-"""Lateral wander of a truck's runs, from what their profile mismatches share off the bridge.
+"""Lateral wander of a truck's runs, from the shared part of their mismatches off the bridge.
 
 The runs of a wheel-path group are first aligned along the road: receivers err by half a metre, as
 long as the waves that show the wander. The road profile aligns them to centimetres. The shared
@@ -58,7 +58,7 @@ def wander_grid_m() -> FloatArray:
 def align_runs_m(
     runs: Sequence[OffBridgeMismatch | None], roads: Sequence[Profile | None]
 ) -> FloatArray:
-    """Return the chainage (k,) in m by which each run has the same road later than the others.
+    """Return the shift (k,) in m of each run's road along the chainage, relative to the others.
 
     Without all road profiles the mismatches are compared instead.
     """
@@ -126,7 +126,7 @@ def _mean_known(bent: FloatArray) -> FloatArray:
 
 
 def _gain(one: FloatArray, other: FloatArray, step_m: float) -> float:
-    """Return the gain of log-likelihood by what two series share; a metre has one free value."""
+    """Return the log-likelihood gain of a common part of two series, one free value a metre."""
     both = np.isfinite(one) & np.isfinite(other)
     size = float(np.sqrt((one[both] @ one[both]) * (other[both] @ other[both])))
     correlation = float(one[both] @ other[both]) / size if size > 0.0 else 0.0
@@ -202,7 +202,7 @@ def _claimed_power(mismatch: Mismatch) -> tuple[float, float]:
 
 
 def wander_posterior(mismatch: Mismatch, share: SharedFraction | None) -> WanderPosterior:
-    """Return the wander of runs that have this part of the short waves in common.
+    """Return the posterior of the wander, given the runs' shared fraction of the short waves.
 
     Without a share it is the prior's.
     """

@@ -74,7 +74,7 @@ class OtherRealms:
         self.alive: set[str] = set()
         """The trucks of this realm that are there now."""
         self.trucks: dict[str, set[str]] = {}
-        """Other realms and the trucks that were heard in them."""
+        """Other realms and the trucks active in them."""
 
     def look(self) -> None:
         """Process the messages since the last call."""

@@ -133,7 +133,7 @@ def serve_metrics(
 def _follow(
     bus: zenoh.Session, where: str, board: HealthBoard, is_over: Callable[[], bool]
 ) -> None:
-    """Note every health, until none has come for so long that the connection may be stale."""
+    """Store every health message, until silence suggests that the connection is stale."""
     with bus, Subscription(bus, where) as subscription:
         heard_s = time.monotonic()
         while not is_over() and time.monotonic() - heard_s < OLDEST_S:
@@ -178,5 +178,5 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, text: str, *arguments: object) -> None:
-        """Log requests on request only."""
+        """Log HTTP requests with --verbose only."""
         _log.debug(text, *arguments)

@@ -15,7 +15,7 @@ Announce = Callable[[str], Callable[[], None]]
 
 
 class Subcommand(NamedTuple, Generic[_Asked]):
-    """A command: the class of its options, and the function that takes an instance."""
+    """A command: the class of its options, and the function that runs it with an instance."""
 
     name: str
     options: type[_Asked]
@@ -41,7 +41,7 @@ class ServiceCommand(NamedTuple, Generic[_Asked]):
     summary: str
     example: str
     run: Callable[[_Asked, Announce], int]
-    """Function of the options, and of one that makes an announcement of a line."""
+    """Function of the options and of a function that announces a line."""
 
     def add(self, commands: Any) -> None:
         """Add the command to a parser."""
@@ -74,7 +74,7 @@ def _add_fields(parser: argparse.ArgumentParser, options: Any) -> None:
 
 
 def _filled(options: type[_Asked], given: argparse.Namespace) -> _Asked:
-    """Return the instance that holds what was given."""
+    """Return the instance of the options with the parsed values."""
     values = {}
     for one in fields(options):  # type: ignore[arg-type]
         option: Option = one.metadata[OPTION]

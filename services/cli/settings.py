@@ -26,7 +26,7 @@ _MANY: Final = "many crossings"
 
 @dataclass(frozen=True, kw_only=True)
 class IdentifyOptions:
-    """Recordings, how their crossings are identified, and what is written."""
+    """Options of `driveby identify`: recordings, search and outputs."""
 
     recordings: tuple[Path | str, ...] = positional(
         "recordings, also as s3://…; with --into also folders of them",

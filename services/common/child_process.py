@@ -74,7 +74,7 @@ def run_gently(arguments: Sequence[str], closing: threading.Event) -> ChildOutpu
 def end_with_parent() -> None:
     """Let this process of a pool end at once when its parent dies: an initializer.
 
-    Otherwise it would finish its work for nobody, and then wait for more for ever.
+    Otherwise it would finish its work unused, and then wait for more for ever.
     """
     parent = multiprocessing.parent_process()
     if parent is not None:

@@ -1,4 +1,4 @@
-"""Optional packages: which extra brings each, and what a command says that lacks one."""
+"""Optional packages: which extra brings each, and the error of a command that lacks one."""
 
 from collections.abc import Iterable, Mapping
 from importlib.util import find_spec

@@ -191,7 +191,7 @@ def _record(
 def _take_batch(
     logger: _Logger, subscriptions: deque[Subscription], stop: threading.Event
 ) -> float:
-    """Take the messages received within a short time, else pause; return the time after it."""
+    """Process the messages received within a short time, or pause; return the monotonic time."""
     received = _receive(subscriptions)
     if received is None:
         stop.wait(_PAUSE_S)
@@ -245,7 +245,7 @@ def _report(logger: _Logger, announcements: "_Announcements", *, closing: bool) 
 
 
 class _Announcements:
-    """A thread that publishes `durable`, `event` and `health`.
+    """Publisher thread of `durable`, `event` and `health`.
 
     A put to a congested connection blocks, which must hold up neither receiving nor writing.
     """

@@ -78,12 +78,12 @@ class LoggerSettings:
 
     @property
     def written(self) -> Path:
-        """Folder that is written to."""
+        """Folder of the recordings; with `file` that of the file."""
         return self.folder if self.file is None else self.file.parent
 
     @property
     def limits(self) -> "RotationLimits":
-        """Start of the next file of a truck, and free space of the disk."""
+        """Limits of a file's age and size, and of free disk space."""
         from services.logger.writer import RotationLimits
 
         return RotationLimits(

@@ -57,7 +57,7 @@ class ReplayStatistics(NamedTuple):
 
     @property
     def messages(self) -> int:
-        """The number of messages of all streams."""
+        """Number of messages of all streams."""
         return sum(self.by_stream.values())
 
 

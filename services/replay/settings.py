@@ -21,7 +21,7 @@ _PATTERNS = "patterns with * and ?, commas between, of STREAM or OWNER/ID/STREAM
 
 @dataclass(frozen=True, kw_only=True)
 class ReplaySettings:
-    """A drive, what of it is published, and how."""
+    """Options of `driveby replay`: a drive, its published part, and the pace."""
 
     recordings: tuple[Path, ...] = positional(
         "recordings, or folders of them: one drive, in the order of time",

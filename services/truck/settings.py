@@ -34,7 +34,7 @@ def _spool_budget_option() -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class TruckSettings:
-    """A recording and the bus on which it is played as a truck that drives now."""
+    """Options of `driveby truck`: a recording, and the bus on which it is published."""
 
     recording: Path = positional(
         "measurements to publish: a recording, or a folder of CSV files with --site",
@@ -63,7 +63,7 @@ class TruckSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class GatewaySettings:
-    """A router of ROS 2, the truck behind it, and the bus to which its data are published."""
+    """Options of `driveby gateway`: a ROS 2 router, its truck, and the bus for its data."""
 
     what: str = positional("ros2: with rmw_zenoh, see docs/truck.md", choices=("ros2",))
     ros: str = opt(

@@ -23,7 +23,7 @@ _LIVE: Final = "live"
 
 @dataclass(frozen=True, kw_only=True)
 class ViewSettings:
-    """A file or the bus to show, and where viewers connect."""
+    """Options of `driveby view`: a file or the bus, and the address for viewers."""
 
     target: str = positional(
         "a .mcap, .json or .rrd file; live: the messages on the bus",

@@ -36,8 +36,8 @@ here was shown on a real bridge: no public record of one is known.
 _DRAWN = """
 ## Crossings drawn from the priors
 
-{crossings} crossings, seeds 0 to {last}. For each, everything that the method calls unknown is
-drawn from what its site file says of it: the truck (log-normal, 15 %), EI of every element
+{crossings} crossings, seeds 0 to {last}. For each, every parameter of the method is drawn from its
+prior by the site file: the truck (log-normal, 15 %), EI of every element
 (log-normal, 0.55 of ln EI), mass per length (10 %), Rayleigh damping (50 %), support springs
 and how far bearings give (half-normal, or absent as likely as not), tyre damping (half-normal),
 wheelbase (0.2 %), gains (1 %) and delays (0.5 ms) of the channels, the total mass
@@ -85,8 +85,8 @@ _CONTROL = """
 ## A check that can fail
 
 The same crossings, seeds 0 to {last}, with the noise declared half of what it is: {good} of
-{count} are `good`, {named} of {count} say so (`noise_above_declared`, `model_misfit` or
-`residuals_coloured`).
+{count} are `good`, {named} of {count} have a reason for it (`noise_above_declared`,
+`model_misfit` or `residuals_coloured`).
 """
 
 _SCENARIOS = """

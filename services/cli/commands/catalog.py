@@ -21,7 +21,7 @@ _NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class CatalogOptions:
-    """A folder of recordings, and what is listed of it."""
+    """Options of `driveby catalog`: a folder of recordings, and the listing."""
 
     folder: str = positional("folder with recordings below", metavar="DIR|s3://…")
     verify: bool = flag(

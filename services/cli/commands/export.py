@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """Recordings and results to export, and where to."""
+    """Options of `driveby export`: recordings and results, and the folder for the files."""
 
     sources: tuple[Path, ...] = positional(
         "recordings, folders with recordings below, and at most one results file",
@@ -36,7 +36,7 @@ class ExportOptions:
 
 
 class _Found(NamedTuple):
-    """Options of `driveby export`."""
+    """Contents of the sources to export."""
 
     site: "Site | None"
     results: "Results | None"

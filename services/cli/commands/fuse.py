@@ -17,7 +17,7 @@ from services.common.options import (
 
 @dataclass(frozen=True, kw_only=True)
 class FuseOptions:
-    """Results to fuse, and what is written."""
+    """Options of `driveby fuse`: results to fuse, and outputs."""
 
     results: tuple[Path, ...] = positional("results", Path, nargs="+", metavar="RESULTS.json")
     json: Path | None = output_option(

@@ -18,7 +18,7 @@ EXIT_CLEAN, EXIT_LOSSY = 0, 3
 
 @dataclass(frozen=True, kw_only=True)
 class RecoverOptions:
-    """A recording to rewrite, and what becomes of it."""
+    """Options of `driveby recover`: a recording to rewrite, and its treatment."""
 
     recording: Path = positional("recording to rewrite; left as it is", Path, metavar="REC.mcap")
     output: Path | None = output_option(

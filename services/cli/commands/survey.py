@@ -23,7 +23,7 @@ def _speeds(text: str) -> tuple[float, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyPlanOptions:
-    """A survey to forecast, and what is written."""
+    """Options of `driveby survey`: a survey to forecast, and outputs."""
 
     site: Path = site_option(
         "site file of truck, bridge and sensors, as docs/site.example.toml; its first vehicle "
