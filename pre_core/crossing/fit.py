@@ -40,7 +40,7 @@ it."""
 _CLEAR_FRICTION_WEIGHT = 0.05
 """Suspension weight below which full weight is not tried: the friction is clear."""
 _NO_FIT_CHI2 = 10.0
-"""Limit of chi2 at five times the noise: sound starts of 90 drawn crossings had 1.6 at most, wrong
+"""Limit of chi2 at five times the noise: right starts of 90 drawn crossings had 1.6 at most, wrong
 ones 10 to 70."""
 _MAX_ROUNDS, _EARLY_ROUNDS = 6, 2
 """Limit of alternating fits and noise estimates, finally and in earlier stages."""

@@ -1,13 +1,13 @@
 """Method `pre`: search for the optimum of one crossing's posterior.
 
-The posterior has one deep minimum and many shallow ones: with every element free, a bridge placed
-half a metre too far can be explained almost as well by other rigidities. So the search
+The negative log posterior has one deep minimum and many shallow ones: with every element free, a
+bridge placed half a metre too far fits almost as well with other rigidities. So the search
 
     1. finds truck and trajectory while the bridge may change only as a whole, with a noise far
        above the actual one, reduced step by step;
     2. scans longitudinal offsets of the bridge (`walk`);
-    3. frees everything (`fit`) from the best offset, and from the next best ones if that does not
-       fit, unless it fits so badly that none would.
+    3. fits all parameters (`fit`) from the best offset, and from the next best ones if that does
+       not fit, unless it fits so badly that none would.
 
 If the result is a misfit because of hum, the search is repeated without the hum (`lines`).
 """
@@ -53,22 +53,22 @@ _COARSE_WITH_MISMATCH = (*_COARSE, (10.0, 4))
 """First stage with mismatch, which is noise from the beginning, estimated again after every step:
 with sensor noise alone the search would fail."""
 NOISY, HOPELESS_NOISE = 2.0, 25.0
-"""Noise power ratio, even over the body equations, above which noise is inflated; above the second
-the sensor is another one, or broken."""
+"""Noise power ratio, the same in all body equations, above which the fit inflates the noise; above
+the second the sensor is another one, or broken."""
 _CLEAR_MISMATCH = 200.0
 """Mean square of whitened residuals off the bridge after the first stage: of 100 drawn crossings of
 one profile 130 at most and mostly below 25, with twin tyres on the best class of road 200,000."""
 _CLEAR_RESTRAINT = 0.5
-"""Scales of their prior above which restraints, bearing compliance and torsion are tried without.
-"""
+"""Size of restraints, bearing compliance or torsion, in scales of their priors, above which the
+search is repeated without them."""
 _MAX_MOVES = 4
 """Limit of moves from an optimum to a neighbouring one."""
 _SAME_MINIMUM_M = 0.2
 """Distance within which offsets lead to one minimum."""
 _HOPELESS_CHI2 = (1000.0, 25.0)
 """Values of chi2 above which no other offset is tried, after one candidate and after more. Of 70
-drawn sound crossings the first candidate was right in all; another one never reduced such a chi2 to
-a usable one."""
+drawn fault-free crossings the first candidate was right in all; another one never reduced such a
+chi2 to a usable one."""
 _MAX_EVALUATIONS = 100_000
 """Limit of a whole search. The sample takes 2,000, a site file with two supports too many 65,000:
 beyond this a search has failed, and its numbers are not reliable."""
@@ -126,7 +126,7 @@ def _evaluations_of_all(found: list[Optimum]) -> int:
 def _run_strategies(
     problem: PosteriorProblem, y: FloatArray, report: Report, max_evaluations: int
 ) -> list[Optimum]:
-    """Return what the ways led to, up to the first that is final or shows a line."""
+    """Return the optima of the strategies, up to the first that is final or shows a line."""
     simplest = _SIMPLEST
     if has_tandem(problem):
         simplest = _WITH_MISMATCH[0 if problem.crossing.lead.is_equalised else 1]
@@ -137,7 +137,7 @@ def _run_strategies(
 
 
 def _has_ended(found: Optimum) -> bool:
-    """Whether no other way is tried: this is final, or a line is to be silenced first."""
+    """Return whether no other strategy is tried: this is final, or shows a line to remove first."""
     if _is_final(found) or len(found.problem.lines_hz) == _MAX_LINES:
         return _is_final(found)
     return strongest_line_at_hz(found.problem, found.state.y) > 0.0
@@ -284,7 +284,7 @@ def _find_truck(
 
 
 def _with_free_ends(found: Optimum, strategy: SearchStrategy) -> tuple[Optimum, int]:
-    """Return the better of an optimum with rotational restraints and one without, and evaluations.
+    """Return the better optimum, with rotational restraints or without, and the evaluations.
 
     A bridge restrained at both ends with less than half its stiffness deflects nearly as one on
     free bearings, with a truck that is wrong by a third of its prior: a search that gets there
