@@ -117,7 +117,7 @@ def wait_for_router(
             return open_session(connect=endpoint, timeout_s=_CONNECT_S, tls=tls)
         except FailureError as error:
             if not is_logged:
-                _log.warning("%s; trying on", error)
+                _log.warning("%s; retrying", error)
             is_logged = True
     return None
 

@@ -104,7 +104,7 @@ def catalog_closed(folder: Path, recording: Path) -> None:
         here = folder_at(str(folder))
         add(here, row_of(here, Entry(name, status.st_size, status.st_mtime_ns)))
     except FileNotFoundError:
-        _log.info("%s is gone and gets no row in the catalogue", recording.name)
+        _log.info("%s disappeared; it gets no row in the catalogue", recording.name)
     except (InputError, FailureError, OSError, ValueError) as error:
         _log.warning("%s is not in the catalogue yet: %s", recording.name, error)
 

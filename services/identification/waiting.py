@@ -132,8 +132,8 @@ class Waiting:
         self._pending.append(pending)
         if len(self._pending) > MAX_WAITING_CROSSINGS:
             _log.warning(
-                "%s has waited too long and is abandoned here: it is taken from the logger's "
-                "recording later, or `driveby identify` gives its result from there",
+                "too many crossings wait; dropping %s: it is identified later from the logger's "
+                "recording, or by `driveby identify`",
                 self._pending.popleft().work.crossing_id,
             )
         if not self.is_certified(pending.pair) and pending.pair not in self._wanted:

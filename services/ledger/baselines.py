@@ -34,7 +34,7 @@ def baselines_of(
             continue
         path = (beside or Path()) / bridge.baseline
         if beside is None and not path.is_file():
-            _log.warning("the baseline %s of %s is not there; see --baseline", path, bridge.id)
+            _log.warning("the baseline %s of %s is missing; see --baseline", path, bridge.id)
             continue
         out[bridge.id] = stored_state(path, bridge)
     return out

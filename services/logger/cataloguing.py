@@ -53,7 +53,7 @@ class Cataloguing:
             while not self._closing.wait(_COLLECT_S):
                 missing = self._write_in_children(self._take())
         except Exception:  # recording matters more, and `driveby catalog` adds a missing row
-            _log.exception("catalogue")
+            _log.exception("the catalogue cannot be updated; recording continues")
         missing += self._write_last(self._take())
         if missing:
             _log.info(

@@ -82,7 +82,7 @@ class Housekeeping:
                 if self._closing.wait(_BUDGET_PERIOD_S):
                     return
         except Exception:  # recording continues without it
-            _log.exception("housekeeping ended")
+            _log.exception("housekeeping failed; recording continues without it")
         finally:
             self.is_busy = False
 

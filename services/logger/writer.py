@@ -203,7 +203,7 @@ class FileWriter:
         except _WriteFailed as failed:
             self._stop(failed.name, f"recording stopped: {failed.reason}", failed.kind)
         except Exception as error:  # any error must be reported, and no thread left waiting
-            _log.exception("writer")
+            _log.exception("writing failed; recording stops")
             self._stop(None, f"recording stopped: {error}", EventKind.WRITE_ERROR)
         finally:
             self._syncing.shutdown()

@@ -250,7 +250,7 @@ class Gateway:
             if time.monotonic() >= self._complained_s + _COMPLAINT_PERIOD_S:
                 self._complained_s = time.monotonic()
                 self.log.error(
-                    "%s: spool: %s; %d messages so far were published without being on disk",
+                    "%s: spool: %s; %d messages were published without being on disk",
                     self.vehicle, error.strerror, self.unspooled,
                 )  # fmt: skip
             return False

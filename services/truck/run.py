@@ -211,8 +211,8 @@ def _log_timing(times: _DriveTiming) -> None:
     if times.ahead_ns > _OLD_S * NS_PER_S:
         begins = datetime.fromtimestamp(time.time() - times.ahead_ns * 1e-9, UTC)
         _log.info(
-            "stamped so that it ends when all is published: it begins at %s UTC, its first samples "
-            "are %.0f s old when they are sent, and so are its crossings' times",
+            "times are shifted so that the drive ends when all is published: it begins at %s UTC, "
+            "its first samples are %.0f s old when published",
             *(f"{begins:%Y-%m-%d %H:%M:%S}", times.ahead_ns * 1e-9),
         )
 

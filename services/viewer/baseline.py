@@ -25,7 +25,7 @@ def named_baseline(
         return None, None
     path = folder / bridge.baseline
     if not required and not path.is_file():
-        _log.warning("%s: the baseline %s is not there", bridge.id, path)
+        _log.warning("%s: the baseline %s is missing", bridge.id, path)
         return None, None
     return stored_baseline(bridge, path)
 
