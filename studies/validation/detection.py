@@ -133,7 +133,7 @@ def _share(those: Sequence[bool]) -> float | None:
     return float(np.mean(those)) if those else None
 
 
-HEADINGS = ("survey", "fused", "groups", "named", "below", "loss", "accused", "of sound")
+HEADINGS = ("survey", "fused", "groups", "named", "below", "loss", "false", "undamaged")
 
 
 def cells(line: DetectionSummary) -> list[str]:
