@@ -249,7 +249,7 @@ def test_page_holds_every_aim_and_every_part() -> None:
     for check in aims(outcome):
         assert f"| {check.name.replace('|', chr(92) + '|')} |" in page
     assert "40 crossings, seeds 0 to 39" in page
-    assert "0 of 5 are `good`, 5 of 5 say so" in " ".join(page.split())
+    assert "0 of 5 are `good`, 5 of 5 have a reason for it" in " ".join(page.split())
     assert "| 12 | EI_7 | 0.40 |" in page
     assert "d1_clean_const_speed 0 | good" in page
     assert "{" not in page

@@ -265,5 +265,6 @@ def test_overdue_crossings_are_reported_as_given_up(
     assert len(crossings) == 5
     assert asking.engine.waiting() == {PAIR: crossings[2:]}
     lines = [record.getMessage() for record in caplog.records]
-    assert [line.split(" ")[0] for line in lines] == crossings[:2]
+    assert len(lines) == 2
+    assert all(f"dropping {name}:" in line for name, line in zip(crossings, lines, strict=False))
     assert all("driveby identify" in line for line in lines)
