@@ -22,7 +22,6 @@ from schemas.site import Bridge, Site
 from schemas.validation_records import VehicleBridgePair
 from services.catalogue.contents import summarise_recording
 from services.cli.bridge_table import print_bridge, print_elements
-from services.cli.parsing import CERTIFICATES
 from services.cli.settings import IdentifyOptions
 from services.common.errors import FailureError, InputError
 from services.common.files import (
@@ -31,6 +30,7 @@ from services.common.files import (
     replaced_atomically,
     write_atomically,
 )
+from services.common.options import CERTIFICATES
 from services.common.progress import parts_bar, reading_bar, steps_bar
 from services.execution.dispatch import CrossingExecutor
 from services.execution.offline import identify_drives, messages_of_trucks, site_of

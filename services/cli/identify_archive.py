@@ -14,10 +14,11 @@ from services.catalogue.index import update_catalog
 from services.catalogue.positions import crossings_of
 from services.cli.bridge_table import print_bridge
 from services.cli.identify import check_certificates, warn_of_no_noise
-from services.cli.parsing import CERTIFICATES, EXIT_SOMETHING_LOST
+from services.cli.parsing import EXIT_SOMETHING_LOST
 from services.cli.settings import IdentifyOptions
 from services.common.errors import InputError
 from services.common.files import check_writable, make_folder, write_atomically
+from services.common.options import CERTIFICATES
 from services.common.progress import progress_bar
 from services.common.stores import Folder, files_below, folder_at
 from services.execution.archive import ArchiveJob, ArchiveResult, identify_archive

@@ -32,22 +32,22 @@ from services.cli.commands.gateway import GATEWAY
 from services.cli.commands.health import HEALTH
 from services.cli.commands.history import HISTORY
 from services.cli.commands.identify import IDENTIFY
+from services.cli.commands.import_drive import IMPORT
 from services.cli.commands.info import INFO
 from services.cli.commands.logger import LOGGER
 from services.cli.commands.recover import RECOVER
 from services.cli.commands.replay import REPLAY
+from services.cli.commands.report import REPORT
+from services.cli.commands.simulate import SIMULATE
 from services.cli.commands.survey import SURVEY
 from services.cli.commands.truck import TRUCK
+from services.cli.commands.validate import VALIDATE
 from services.cli.commands.view import VIEW
 from services.cli.commands.watch import WATCH
 from services.cli.commands.worker import WORKER
 from services.cli.completion import SHELLS, completion
 from services.cli.needs import check_needs
-from services.cli.offline import add_import
 from services.cli.parsing import Files, Handler, Parser, add_common, files_of
-from services.cli.report import add_report
-from services.cli.simulate import add_simulate
-from services.cli.validation import add_validate
 from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
 from services.common.files import check_kind, is_unicode, name_error
 from services.common.log_lines import configure_logging
@@ -61,8 +61,8 @@ _COUNTS_AT_EXIT: Final = ("_duckdb", "duckdb")
 _COMMANDS: Final = (
     SURVEY.add,
     CHECK.add,
-    add_simulate,
-    add_import,
+    SIMULATE.add,
+    IMPORT.add,
     IDENTIFY.add,
     FUSE.add,
     HISTORY.add,
@@ -70,8 +70,8 @@ _COMMANDS: Final = (
     INFO.add,
     CATALOG.add,
     EXPORT.add,
-    add_report,
-    add_validate,
+    REPORT.add,
+    VALIDATE.add,
     RECOVER.add,
     VIEW.add,
     DEMO.add,

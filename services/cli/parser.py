@@ -61,9 +61,10 @@ def _add_fields(parser: argparse.ArgumentParser, options: Any) -> None:
         if titled not in groups:
             groups[titled] = parser.add_argument_group(option.group)
         place = (option.group, option.alternatives)
-        if place not in groups:
-            groups[place] = groups[titled].add_mutually_exclusive_group()
         settings = dict(option.settings)
+        is_one_required = bool(option.alternatives) and settings.pop("required", False)
+        if place not in groups:
+            groups[place] = groups[titled].add_mutually_exclusive_group(required=is_one_required)
         is_repeated = settings.get("action") in ("append", "extend")
         if one.default is not MISSING and not is_repeated:
             settings["default"] = one.default

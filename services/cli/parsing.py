@@ -10,20 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn
 
 from services.common.errors import InputError
-from services.common.kinds import MCAP, Kind
-from services.common.options import (
-    RECORDINGS,
-    OutputFile,
-    folder_here,
-    number,
-    whole,
-)
+from services.common.kinds import Kind
+from services.common.options import OutputFile, folder_here
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-SCENARIOS: Final = range(1, 13)
-CERTIFICATES: Final = RECORDINGS / "certificates"
 EXIT_SOMETHING_LOST: Final = 3
 """Exit code of a success in which input could not be read or identified."""
 
@@ -67,11 +59,6 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise InputError."""
         raise InputError(f"{message} (see {self.prog} --help)")
-
-
-def option_of(name: str) -> str:
-    """Return the option whose value has this name among the parsed ones."""
-    return f"--{name.replace('_', '-')}"
 
 
 def command(
@@ -142,74 +129,6 @@ def files_of(options: argparse.Namespace) -> Files:
             else:
                 files.inputs.append(path)
     return files
-
-
-def add_site(p: Any, text: str, *, required: bool = False) -> None:
-    """Add `--site`: a site file."""
-    p.add_argument("--site", type=Path, required=required, metavar="SITE.toml", help=text)
-
-
-def add_output(p: argparse.ArgumentParser, *, required: bool = True) -> None:
-    """Add `-o`: the recording to write, which is replaced with `--force` only."""
-    p.add_argument(
-        "-o",
-        "--output",
-        type=OutputFile((MCAP,)),
-        required=required,
-        metavar="REC.mcap",
-        help="recording to write",
-    )
-    add_force(p)
-
-
-def add_force(p: argparse.ArgumentParser) -> None:
-    """Add `--force`: replace existing files."""
-    p.add_argument(
-        "--force",
-        action="store_true",
-        help="replace an existing recording, unless it is being written",
-    )
-
-
-def add_file(p: Any, option: str, metavar: str, text: str) -> None:
-    """Add an option that names a file to read."""
-    p.add_argument(option, type=Path, metavar=metavar, help=text)
-
-
-def add_output_file(p: Any, option: str, metavar: str, text: str, *kinds: Kind) -> None:
-    """Add an option that names a file to write, which replaces a file of these kinds only."""
-    p.add_argument(option, type=OutputFile(kinds), metavar=metavar, help=text)
-
-
-def add_output_folder(p: Any, option: str, text: str, *, required: bool = False) -> None:
-    """Add an option that names a folder to write to."""
-    p.add_argument(option, type=folder_here, required=required, metavar="DIR", help=text)
-
-
-def add_certificates(p: Any, text: str) -> None:
-    """Add `--validations`: a folder of validation records."""
-    p.add_argument("--validations", type=Path, metavar="DIR", help=text)
-
-
-def add_seed(p: argparse.ArgumentParser) -> None:
-    """Add `--seed` of all random numbers."""
-    p.add_argument(
-        "--seed", type=whole("a seed", 0), default=1, help="seed of all random numbers (default: 1)"
-    )
-
-
-def add_noise(p: argparse.ArgumentParser, text: str, default: float = 0.0) -> None:
-    """Add `--noise` of the accelerometers."""
-    p.add_argument(
-        "--noise", type=number("a noise density", low=0, high=1e6), default=default, help=text
-    )
-
-
-def scenario(text: str) -> int:
-    """Parse the number of a damage scenario of the paper."""
-    if not text.isascii() or not text.isdigit() or int(text[:9]) not in SCENARIOS:
-        raise argparse.ArgumentTypeError(f'is "{text}", it must be 1 to 12')
-    return int(text)
 
 
 def a_console() -> "Console":

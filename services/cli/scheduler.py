@@ -6,9 +6,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from services.cli.parsing import option_of
 from services.cli.settings import IdentifyOptions
 from services.common.errors import InputError
+from services.common.options import option_of
 
 if TYPE_CHECKING:
     from services.execution.dispatch import CrossingExecutor

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from services.cli.parsing import CERTIFICATES
 from services.common.kinds import ARRAYS, NETCDF, RERUN, RESULTS
 from services.common.options import (
+    CERTIFICATES,
     baseline_option,
     fuse_suspect_option,
     method_option,

@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from services.common.endpoints import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT
-from services.common.kinds import Kind
+from services.common.kinds import MCAP, Kind
 
 RECORDINGS: Final = Path("recordings")
+CERTIFICATES: Final = RECORDINGS / "certificates"
+SCENARIOS: Final = range(1, 13)
 METHODS: Final = ("pre", "least-squares", "random-walk")
 OPTION: Final = "option"
 """Key of a field's metadata under which its `Option` is."""
@@ -44,13 +46,14 @@ def opt(
 ) -> Any:
     """Return the field of an option; `text` is its help, `parse` makes the value.
 
-    It has no default if it is `required`. An option that is given repeatedly (`action`) has the
+    It has no default if it is `required`; of `alternatives` that are required, one has to be given.
+    An option that is given repeatedly (`action`) has the
     default `()`, and makes a tuple.
     """
     if parse is not None:
         settings["type"] = parse
     option = Option(flags, group, alternatives, {"help": text, **settings})
-    is_required = settings.get("required", False)
+    is_required = settings.get("required", False) and not alternatives
     return field(default=MISSING if is_required else default, metadata={OPTION: option})
 
 
@@ -99,16 +102,31 @@ def speed_option(default: float, *, zero: str = "", group: str = "") -> Any:
     )
 
 
-def file_option(text: str, metavar: str) -> Any:
+def file_option(text: str, metavar: str, *, group: str = "") -> Any:
     """Return an option that names a file to read."""
-    return opt(text, Path, metavar=metavar)
+    return opt(text, Path, group=group, metavar=metavar)
 
 
 def output_option(
-    text: str, metavar: str, *kinds: Kind, flags: tuple[str, ...] = (), required: bool = False
+    text: str,
+    metavar: str,
+    *kinds: Kind,
+    flags: tuple[str, ...] = (),
+    group: str = "",
+    default: Path | None = None,
+    required: bool = False,
 ) -> Any:
     """Return an option that names a file to write, which replaces a file of these kinds only."""
-    return opt(text, OutputFile(kinds), flags=flags, metavar=metavar, required=required)
+    parse = OutputFile(kinds)
+    return opt(
+        text, parse, flags=flags, group=group, default=default, metavar=metavar, required=required
+    )
+
+
+def recording_option(*, required: bool = False) -> Any:
+    """Return `-o`: the recording to write, which is replaced with `--force` only."""
+    flags = ("-o", "--output")
+    return output_option("recording to write", "REC.mcap", MCAP, flags=flags, required=required)
 
 
 def output_folder_option(text: str, *, group: str = "", required: bool = False) -> Any:
@@ -158,9 +176,9 @@ def force_option() -> Any:
     return flag("replace an existing recording, unless it is being written")
 
 
-def validations_option(text: str) -> Any:
+def validations_option(text: str, *, group: str = "") -> Any:
     """Return `--validations`: a folder of validation records."""
-    return opt(text, Path, flags=("--validations",), metavar="DIR")
+    return opt(text, Path, flags=("--validations",), group=group, metavar="DIR")
 
 
 def baseline_option() -> Any:
@@ -172,6 +190,18 @@ def baseline_option() -> Any:
 def fuse_suspect_option() -> Any:
     """Return `--fuse-suspect`."""
     return flag("fuse suspect crossings too; the bridge's estimate is suspect then")
+
+
+def option_of(name: str) -> str:
+    """Return the option whose value has this name among the parsed ones."""
+    return f"--{name.replace('_', '-')}"
+
+
+def scenario(text: str) -> int:
+    """Parse the number of a damage scenario of the paper."""
+    if not text.isascii() or not text.isdigit() or int(text[:9]) not in SCENARIOS:
+        raise argparse.ArgumentTypeError(f'is "{text}", it must be 1 to 12')
+    return int(text)
 
 
 def source(text: str) -> Path | str:

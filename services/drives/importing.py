@@ -2,8 +2,9 @@
 
 import logging
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from schemas.site import Site
 from schemas.site_file import load_site, parse_site, read_site_text
@@ -22,6 +23,8 @@ from services.drives.csv_runs import (
 )
 from services.drives.ros2_recording import is_ros2, messages_of_ros2
 from services.drives.runs import Run, normalised, run_to_messages
+from services.drives.settings import ImportOptions
+from services.drives.tables.mapping import load_map
 from services.drives.tables.reading import Understood
 from services.finding.placed import middle_sensor, rates_hz
 from services.recordings.writer import write_recording
@@ -32,71 +35,84 @@ _LARGEST_RATE_ERROR = 0.05
 """Largest relative error of a rate; wrong units and wrong site files exceed it by far."""
 
 
+class _Drive(NamedTuple):
+    """The drive to import: its site file, truck and realm."""
+
+    site_text: str
+    site: Site
+    site_name: str
+    vehicle_id: str
+    realm: str
+
+
 def import_command(
-    *,
-    sources: list[Path],
-    site: Path,
+    asked: ImportOptions,
     output: Path,
-    vehicle: str | None,
-    name: str | None,
-    force: bool = False,
-    how: HowToRead = AS_WRITTEN,
+    *,
+    reading: Steps = no_step_progress,
     writing: Steps = no_step_progress,
 ) -> str:
     """Write the recording of a folder, a pair of CSV files, or of ROS 2; return a summary.
 
-    Nothing is written if anything is wrong (InputError). `writing` is called with the seconds of
-    the drive that have been written.
+    Nothing is written if anything is wrong (InputError). `reading` is called with the number of
+    files read, `writing` with the seconds of the drive that have been written.
     """
-    check_writable(output, force=force)
-    text = read_site_text(site)
-    parsed = parse_site(text, str(site))
-    vehicle_id = vehicle_of(parsed, str(site), vehicle)
-    realm = _realm(sources, parsed, name)
-    if len(sources) == 1 and is_ros2(sources[0]):
-        return _import_ros2(sources[0], text, parsed, str(site), output, realm, vehicle_id, force)
-    runs = normalised_runs(sources, parsed, str(site), vehicle_id, how)
-    messages = write_recording(
+    how = _how_to_read(asked, reading)
+    check_writable(output, force=asked.force)
+    text, name = read_site_text(asked.site), str(asked.site)
+    site = parse_site(text, name)
+    vehicle_id = vehicle_of(site, name, asked.vehicle)
+    drive = _Drive(text, site, name, vehicle_id, _realm(asked.sources, site, asked.realm))
+    if len(asked.sources) == 1 and is_ros2(asked.sources[0]):
+        return _import_ros2(asked.sources[0], drive, output, force=asked.force)
+    runs = normalised_runs(asked.sources, site, name, vehicle_id, how)
+    messages = _write(
         output,
-        _with_progress(run_to_messages(runs, parsed, realm, vehicle_id), runs, writing),
-        site_toml=text,
-        reason="import complete",
-        force=force,
+        _with_progress(run_to_messages(runs, site, drive.realm, vehicle_id), runs, writing),
+        drive,
+        force=asked.force,
     )
     drives = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
     seconds = sum(float(run.accel_time_s[-1] - run.accel_time_s[0]) for run in runs)
     return (
-        f"{output}: {drives} of {vehicle_id}, {seconds:.1f} s, {messages} messages, realm {realm}"
+        f"{output}: {drives} of {vehicle_id}, {seconds:.1f} s, {messages} messages, "
+        f"realm {drive.realm}"
     )
 
 
-def understood_drive(
-    sources: list[Path], site: Path, vehicle: str | None, how: HowToRead
-) -> Understood:
+def understood_drive(asked: ImportOptions) -> Understood:
     """Return a drive of CSV files as it is read, with all guesses; nothing is written."""
-    parsed = load_site(site)
-    return understood_runs(sources, parsed, vehicle_of(parsed, str(site), vehicle), how)
+    how = _how_to_read(asked, no_step_progress)
+    site = load_site(asked.site)
+    vehicle_id = vehicle_of(site, str(asked.site), asked.vehicle)
+    return understood_runs(asked.sources, site, vehicle_id, how)
 
 
-def _import_ros2(
-    source: Path,
-    site_text: str,
-    site: Site,
-    site_name: str,
-    output: Path,
-    realm: str,
-    vehicle_id: str,
-    force: bool,
-) -> str:
+def _how_to_read(asked: ImportOptions, reading: Steps) -> HowToRead:
+    mapping = None if asked.map is None else load_map(asked.map)
+    return HowToRead(mapping, asked.zone, asked.start, asked.yes, reading)
+
+
+def _import_ros2(source: Path, drive: _Drive, output: Path, *, force: bool) -> str:
     if output.resolve() in (source.resolve(), *(path.resolve() for path in source.glob("*"))):
         raise InputError(f"{output}: is what is to be imported, give another file to write")
-    truck, messages = messages_of_ros2(source, site, site_name, realm, vehicle_id)
-    written = write_recording(
-        output, messages, site_toml=site_text, reason="import complete", force=force
+    truck, messages = messages_of_ros2(
+        source, drive.site, drive.site_name, drive.realm, drive.vehicle_id
     )
+    written = _write(output, messages, drive, force=force)
     for line in truck.anomalies.news():
         _log.warning("%s: %s", source, line)
-    return f"{output}: a drive of {vehicle_id} with ROS 2, {written} messages, realm {realm}"
+    return (
+        f"{output}: a drive of {drive.vehicle_id} with ROS 2, {written} messages, "
+        f"realm {drive.realm}"
+    )
+
+
+def _write(output: Path, messages: Iterable[Message], drive: _Drive, *, force: bool) -> int:
+    """Write the recording; return the number of messages."""
+    return write_recording(
+        output, messages, site_toml=drive.site_text, reason="import complete", force=force
+    )
 
 
 def messages_of(folder: Path, site: Path, vehicle: str | None) -> Iterator[Message]:
@@ -133,7 +149,7 @@ def _with_progress(
 
 
 def normalised_runs(
-    sources: list[Path],
+    sources: Sequence[Path],
     site: Site | None,
     site_name: str,
     vehicle_id: str,
@@ -175,7 +191,7 @@ def vehicle_of(site: Site, site_name: str, wanted: str | None) -> str:
     raise InputError(f"{site_name}: {problem}, choose with --vehicle one of {', '.join(known)}")
 
 
-def _realm(sources: list[Path], site: Site, name: str | None) -> str:
+def _realm(sources: Sequence[Path], site: Site, name: str | None) -> str:
     """Return the realm of a drive: as named, else that of the site file, else of the folder."""
     if name is not None:
         return f"{_REALM}{checked_identifier(name.removeprefix(_REALM), '--realm')}"

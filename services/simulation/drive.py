@@ -33,27 +33,22 @@ from pre_core.physics.simulate import CoupledResponse, Motion, constant_accelera
 from pre_core.physics.vehicle import HalfCar, static_axle_loads_n
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle
-from schemas.site_file import load_site, parse_site, site_toml
+from schemas.site_file import parse_site, site_toml
 from services.common.errors import FailureError, InputError
-from services.common.files import check_writable
-from services.common.progress import steps_bar
 from services.drives.runs import Run, run_to_messages
-from services.finding.placed import middle_site
 from services.recordings.writer import write_recording
-from services.simulation.lane import Twist, twist_of
+from services.simulation.lane import Twist
 from services.simulation.positions import START_TIME_S as START_TIME_S
 from services.simulation.positions import gnss_track, receiver_of
-from services.simulation.schedule import ONCE, Schedule, begun_at
+from services.simulation.schedule import Schedule, begun_at
 from services.simulation.wheel_paths import (
     AxleRoads,
-    SurfaceOptions,
     WheelPaths,
     roads_of_surface,
-    wheel_paths_of,
 )
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    pass
 
 Floats = NDArray[np.float64]
 
@@ -113,66 +108,6 @@ def paper_site() -> Site:
     """Return the site of the paper: Tables 1 and 2."""
     text = resources.files("services").joinpath("data/paper.toml").read_text(encoding="utf-8")
     return parse_site(text, "paper.toml")
-
-
-def simulate_command(
-    *,
-    site: Path | None,
-    scenario: int | None,
-    ei: Sequence[float] | None,
-    road: str,
-    seed: int,
-    noise: float,
-    speed: tuple[float, float],
-    direction: str,
-    gps_noise: bool,
-    rate: float | None,
-    beyond: OutOfModelEffects = NO_EFFECTS,
-    lane: tuple[float | None, tuple[float, float] | None] = (None, None),
-    surface: SurfaceOptions | None = None,
-    schedule: Schedule = ONCE,
-    drive_seed: int | None = None,
-    output: Path,
-    force: bool = False,
-    console: "Console",
-) -> int:
-    """Write the recording of one simulated crossing, or of several over the same road.
-
-    `lane` has lane offset in m, and ratio of torsional to bending frequency with deck gyration in
-    m; None: as in the site file (see `twist_of`).
-    """
-    check_writable(output, force=force)
-    known = paper_site() if site is None else middle_site(load_site(site))
-    ratios = ratios_of(known.bridges[0], scenario, ei)
-    beyond = beyond._replace(twist=twist_of(known.bridges[0], *lane))
-    drives, paths = [], None if surface is None else wheel_paths_of(known.vehicles[0], surface)
-    of_noise = seed if drive_seed is None else drive_seed
-    with steps_bar("simulating", console) as progress:
-        for number in range(schedule.drives):
-            progress(number, schedule.drives)
-            drive = simulate_drive(
-                known,
-                ratios,
-                road_class=road,
-                seed=seed,
-                noise_ug_per_rthz=noise,
-                speed_m_per_s=speed,
-                forward=direction == "start_to_end",
-                receiver_errors=gps_noise,
-                rate_hz=rate,
-                beyond=beyond,
-                paths=paths,
-                drive_seed=(of_noise, number) if number else of_noise,
-            )
-            drives.append(drive)
-        site_of_sensors = declared_site(known, noise, drives[0].run.rate_hz)
-        messages = write_drives(output, drives, site_of_sensors, force=force, schedule=schedule)
-    times = drives[0].run.accel_time_s
-    console.print(
-        f"{output}: {schedule.in_words()}{times[-1] - times[0]:.1f} s, {messages} messages",
-        highlight=False,
-    )
-    return 0
 
 
 def declared_site(

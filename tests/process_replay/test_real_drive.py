@@ -16,6 +16,7 @@ from services.cli import main as cli
 from services.common.geodesy import bridge_frame, to_chainage
 from services.drives.comma2k19 import read_comma2k19
 from services.drives.importing import import_command
+from services.drives.settings import ImportOptions
 from services.recordings.recording import read_messages
 
 pytestmark = pytest.mark.process
@@ -61,11 +62,7 @@ def test_comma2k19_is_published_recorded_and_replayed(
 ) -> None:
     imported = tmp_path / "imported.mcap"
     import_command(
-        sources=[shared / "real" / "comma2k19"],
-        site=site,
-        output=imported,
-        vehicle=None,
-        name="comma",
+        ImportOptions(sources=(shared / "real" / "comma2k19",), site=site, realm="comma"), imported
     )
     settings = {"listen": endpoint, "folder": tmp_path, "realms": ["*"], "site": None}
 

@@ -9,6 +9,7 @@ from schemas.topics import Key, Message
 from services.catalogue.contents import Gap, summarise_recording
 from services.common.errors import InputError
 from services.drives.importing import import_command
+from services.drives.settings import ImportOptions
 from services.finding.stays import Passage
 from services.recordings.writer import write_recording
 from tests.unit.drives.recorded import START_NS, S, drive
@@ -57,10 +58,7 @@ def test_crossings_are_those_that_are_identified(
         summarise_recording(project / "recordings/sample/crossing.mcap", elsewhere).passings == ()
     )
     path = tmp_path / "example.mcap"
-    import_command(
-        sources=[csv_example], site=csv_example / "site.toml", output=path, force=False,
-        vehicle=None, name=None,
-    )  # fmt: skip
+    import_command(ImportOptions(sources=(csv_example,), site=csv_example / "site.toml"), path)
     assert [p.bridge for p in summarise_recording(path).passings] == [elsewhere.bridges[0].id]
 
 

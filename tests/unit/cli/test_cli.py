@@ -441,7 +441,7 @@ def test_errors_become_a_line_and_an_exit_code(
     code: int,
     line: str,
 ) -> None:
-    def fail(**_: object) -> str:
+    def fail(*_: object, **__: object) -> str:
         raise error
 
     monkeypatch.setattr(importing, "import_command", fail)
@@ -455,7 +455,7 @@ def test_errors_become_a_line_and_an_exit_code(
 def test_log_format_may_stand_before_or_after_the_command(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:
-    def talk(**_: object) -> str:
+    def talk(*_: object, **__: object) -> str:
         logging.getLogger("services.x").info("hello")
         return "done"
 
@@ -487,7 +487,7 @@ def test_a_reader_that_leaves_early_is_no_error(project: Path) -> None:
     code = """
 from services.cli import main as cli
 from services.drives import importing
-importing.import_command = lambda **_: "x" * 100_000
+importing.import_command = lambda *_, **__: "x" * 100_000
 raise SystemExit(cli.main(["import", "x", "--site", "s", "-o", "o"]))
 """
     done = subprocess.run(

@@ -31,6 +31,7 @@ from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.importing import import_command
 from services.drives.runs import GnssTrack, Run, run_to_messages
+from services.drives.settings import ImportOptions
 from services.execution.offline import identify_recordings, site_of
 from services.history.validation_files import save
 from services.recordings.recording import read_messages, read_site
@@ -201,9 +202,7 @@ def test_files_of_another_simulator(shared: Path, tmp_path: Path) -> None:
     for name in ("accel_00.csv", "gps_00.csv", "site.toml"):
         shutil.copy(source / name, folder)
     recording = tmp_path / "d1.mcap"
-    import_command(
-        sources=[folder], site=folder / "site.toml", output=recording, vehicle=None, name=None
-    )
+    import_command(ImportOptions(sources=(folder,), site=folder / "site.toml"), recording)
     site = site_of([recording], None)
     found = identify_recordings([recording], site, IdentificationSettings())
     crossing = only(found)
@@ -218,7 +217,7 @@ def test_files_of_another_simulator(shared: Path, tmp_path: Path) -> None:
     # The same with the whole folder, truth and all.
     whole = tmp_path / "whole.mcap"
     import_command(
-        sources=[source], site=source / "site.toml", output=whole, vehicle=None, name="crossing"
+        ImportOptions(sources=(source,), site=source / "site.toml", realm="crossing"), whole
     )
     assert [m.payload for m in read_messages(whole)] == [
         m.payload for m in read_messages(recording)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from services.cli import main as cli
-from services.cli import validation
+from services.cli.commands import validate
 from services.simulation.effects import EFFECTS
 from services.simulation.survey_kinds import KINDS
 from services.simulation.validation_options import (
@@ -83,7 +83,7 @@ def test_without_a_checkout_a_study_is_refused_in_one_line(
     tmp_path: Path,
     arguments: list[str],
 ) -> None:
-    monkeypatch.setattr(validation, "_CHECKOUT", tmp_path)
+    monkeypatch.setattr(validate, "_CHECKOUT", tmp_path)
     assert cli.main(["validate", *arguments]) == 2
     out, error = capsys.readouterr()
     assert out == ""

@@ -11,6 +11,7 @@ from schemas.site_file import load_site
 from services.catalogue.contents import summarise_recording
 from services.common.progress import parts_bar, reading_bar, steps_bar
 from services.drives.importing import import_command
+from services.drives.settings import ImportOptions
 from services.drives.signals import signals_of_recording
 from services.execution.offline import identify_recordings, site_of
 from services.identification.bridge_state import RecentCrossings, add_crossings, state_of, usable
@@ -106,11 +107,8 @@ def test_each_step_is_reported_up_to_the_last(
         case "import":
             example = project / "tests/data/csv_example"
             import_command(
-                sources=[example],
-                site=example / "site.toml",
-                output=tmp_path / "i.mcap",
-                vehicle=None,
-                name=None,
+                ImportOptions(sources=(example,), site=example / "site.toml"),
+                tmp_path / "i.mcap",
                 writing=progress,
             )
     done, steps = zip(*reported, strict=True)

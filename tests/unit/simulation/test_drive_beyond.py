@@ -13,19 +13,20 @@ from schemas.site_file import parse_site, site_toml
 from services.cli import main as cli
 from services.common.errors import InputError
 from services.execution.offline import identify_recordings, site_of
+from services.simulation.command import effects_of, simulate_command
 from services.simulation.drive import (
     DepartedVehicle,
     OutOfModelEffects,
     SimulatedDrive,
     beam_of,
     paper_site,
-    simulate_command,
     simulate_drive,
     truck_of,
     with_effects,
     write_drive,
 )
 from services.simulation.out_of_model import continuous
+from services.simulation.settings import SimulateOptions
 from services.viewer.crossing_view import view_of_crossing
 from studies.paper.scenarios import models
 
@@ -154,11 +155,11 @@ def test_options_of_simulate_reach_the_truth(
 ) -> None:
     outcome: list[OutOfModelEffects] = []
 
-    def keeping(*, beyond: OutOfModelEffects, **others: object) -> int:
-        outcome.append(beyond)
+    def keeping(asked: SimulateOptions, console: object) -> int:
+        outcome.append(effects_of(asked))
         return 0
 
-    monkeypatch.setattr("services.simulation.drive.simulate_command", keeping)
+    monkeypatch.setattr("services.simulation.command.simulate_command", keeping)
     begin = ["simulate", "--scenario", "6", "-o", str(tmp_path / "x.mcap")]
     assert cli.main(begin) == 0
     assert (
@@ -182,22 +183,21 @@ def test_options_of_simulate_reach_the_truth(
 
 def test_a_recording_with_all_of_it_is_written(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
-    code = simulate_command(
-        site=None,
+    asked = SimulateOptions(
         scenario=6,
-        ei=None,
-        road="A",
-        seed=1,
         noise=25.0,
-        speed=(10.0, 10.0),
         direction="end_to_start",
         gps_noise=True,
         rate=200.0,
-        beyond=OutOfModelEffects(
-            (2e8, 0.0), (2.5e-10, 0.0), DepartedVehicle(3e5, 17.0, 0.1), 0.08, 1.0, 0.2, 1.38
-        ),
+        support_springs=(2e8, 0.0),
+        bearing_stiffness=(4e9, 1e15),
+        departed_vehicle=(3e5, 17.0, 0.1),
+        friction=0.08,
+        friction_growth=1.0,
+        bilinear=0.2,
+        air_springs=1.38,
         output=path,
-        console=Console(quiet=True),
     )
+    code = simulate_command(asked, Console(quiet=True))
     assert code == 0
     assert path.stat().st_size > 10_000

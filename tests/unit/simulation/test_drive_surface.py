@@ -29,7 +29,9 @@ from schemas.site_file import site_toml
 from services.catalogue.contents import summarise_recording
 from services.cli import main as cli
 from services.common.errors import InputError
+from services.simulation import command
 from services.simulation import drive as simulation
+from services.simulation.command import surface_of
 from services.simulation.drive import (
     LONGEST_STEP_S,
     SETTLE_S,
@@ -37,7 +39,8 @@ from services.simulation.drive import (
     paper_site,
     simulate_drive,
 )
-from services.simulation.schedule import BETWEEN_RUNS_S, Schedule
+from services.simulation.schedule import BETWEEN_RUNS_S
+from services.simulation.settings import SimulateOptions
 from services.simulation.wheel_paths import (
     AxleRoads,
     SurfaceOptions,
@@ -216,13 +219,11 @@ def test_options_of_simulate_reach_the_road(
 ) -> None:
     outcome: list[tuple[object, ...]] = []
 
-    def keeping(
-        *, surface: object, schedule: Schedule, drive_seed: int | None, **others: object
-    ) -> int:
-        outcome.append((surface, schedule.runs, drive_seed))
+    def keeping(asked: SimulateOptions, console: object) -> int:
+        outcome.append((surface_of(asked), asked.runs, asked.drive_seed))
         return 0
 
-    monkeypatch.setattr("services.simulation.drive.simulate_command", keeping)
+    monkeypatch.setattr("services.simulation.command.simulate_command", keeping)
     begin = ["simulate", "--scenario", "6", "-o", str(tmp_path / "x.mcap")]
     assert cli.main(begin) == 0
     assert cli.main([*begin, "--road-surface"]) == 0
@@ -246,7 +247,7 @@ def test_several_runs_over_one_surface_are_one_recording(
         drives.append(real(*arguments, **named))
         return drives[-1]
 
-    monkeypatch.setattr(simulation, "simulate_drive", keeping)
+    monkeypatch.setattr(command, "simulate_drive", keeping)
     path = tmp_path / "x.mcap"
     options = "--scenario 6 --seed 4 --noise 25 --rate 200 --speed 20 --road-surface --wander 0.12"
     assert cli.main(["simulate", *options.split(), "--runs", "2", "-o", str(path)]) == 0

@@ -1,0 +1,103 @@
+"""The command `driveby report`: results as a page to hand over."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from services.cli.parser import Subcommand
+from services.common.kinds import HTML, PDF
+from services.common.language import LANGUAGES
+from services.common.options import (
+    file_option,
+    flag,
+    opt,
+    output_option,
+    positional,
+    site_option,
+)
+
+if TYPE_CHECKING:
+    from services.history.periods import Unit
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportOptions:
+    """Options of `driveby report`: results, and the page."""
+
+    results: tuple[Path, ...] = positional(
+        "results of identify or of a worker", Path, nargs="+", metavar="RESULTS.json"
+    )
+    output: Path = output_option(
+        "HTML file to write (default: report.html)",
+        "OUT.html",
+        HTML,
+        flags=("-o", "--output"),
+        default=Path("report.html"),
+    )
+    pdf: bool = flag("also print it to OUT.pdf with an installed browser")
+    site: Path | None = site_option(
+        "site file of the bridges (default: that of a recording in the results' folder)"
+    )
+    baseline: Path | None = file_option(
+        "earlier results, shown beside these with the change (default: the site file's)",
+        "BEFORE.json",
+    )
+    language: str = opt("language (default: en)", default="en", choices=tuple(LANGUAGES))
+    history: Path | None = file_option(
+        "add a page with each bridge over time, from this history", "DIR"
+    )
+    period: "Unit" = opt(
+        "period of fusion (default: month)", default="month", choices=("day", "week", "month")
+    )
+
+
+def _report(asked: ReportOptions) -> int:
+    from schemas.results import load_results
+    from services.common.errors import InputError
+    from services.common.files import check_writable, write_atomically
+    from services.common.language import language_of
+    from services.common.progress import steps_bar
+    from services.ledger.site_of_results import site_of_results
+    from services.report.bridge import bridge_reports, with_histories
+    from services.report.page import page
+    from services.report.pdf import find_browser, write_pdf
+
+    output = asked.output
+    if output.suffix not in (".html", ".htm"):
+        raise InputError(f"{output}: the name of an HTML file (.html) is expected")
+    pdf = output.with_suffix(".pdf")
+    check_writable(output)
+    if asked.pdf:
+        check_writable(pdf, kinds=(PDF,))
+        browser = find_browser()
+    files = []
+    for path in asked.results:
+        results = load_results(path)
+        files.append((path, results, site_of_results(path, results, asked.site)))
+    beside = None if asked.site is None else asked.site.parent
+    language = language_of(asked.language)
+    reports = bridge_reports(files, asked.baseline, beside, language)
+    if asked.history is not None:
+        reports = with_histories(reports, asked.history, asked.period, print)
+    with steps_bar(f"drawing {output}") as progress:
+        text = page(reports, progress, language)
+    write_atomically(output, text)
+    for report in reports:
+        print(f"{report.bridge.id}: {report.finding.headline} {' '.join(report.finding.sentences)}")
+    if not reports:
+        print("no crossing of a known bridge")
+    print(output)
+    if asked.pdf:
+        with steps_bar(f"printing {pdf}") as progress:
+            write_pdf(output, pdf, browser, progress)
+        print(pdf)
+    return 0
+
+
+REPORT: Final = Subcommand(
+    "report",
+    ReportOptions,
+    "write results as one printable HTML file, and PDF",
+    "driveby report drive.json --site site.toml -o report.html",
+    _report,
+)

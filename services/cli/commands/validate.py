@@ -1,0 +1,216 @@
+"""The command `driveby validate`: simulated crossings compared with the truth and the paper."""
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Final, TypeVar
+
+from services.cli.parser import Subcommand
+from services.cli.parsing import a_console
+from services.common.errors import InputError
+from services.common.kinds import AIMS_JSON, RECORDS, VALIDATION_JSON, VALIDATION_PAGE
+from services.common.options import (
+    CERTIFICATES,
+    SCENARIOS,
+    names,
+    noise_option,
+    opt,
+    option_of,
+    output_folder_option,
+    output_option,
+    scenario,
+    seed_option,
+    site_option,
+    validations_option,
+    whole,
+)
+from services.simulation.effects import EFFECTS
+from services.simulation.survey_kinds import KINDS
+from services.simulation.validation_options import (
+    CertificateOptions,
+    IntervalOptions,
+    ScenarioOptions,
+    SurveyOptions,
+)
+
+_CHECKOUT: Final = Path(__file__).parents[3]
+_Options = TypeVar("_Options", CertificateOptions, ScenarioOptions, IntervalOptions, SurveyOptions)
+_OF_CERTIFICATES: Final = frozenset(field.name for field in fields(CertificateOptions))
+_OF_METHODS: Final = frozenset(
+    field.name
+    for kind in (ScenarioOptions, IntervalOptions, SurveyOptions)
+    for field in fields(kind)
+)
+
+
+_OF_SITE: Final = "certificates of --site, see docs/worker.md"
+_KINDS: Final = tuple(KINDS)
+
+
+def _scenarios(text: str) -> tuple[int, ...]:
+    if text == "all":
+        return tuple(SCENARIOS)
+    return tuple(dict.fromkeys(scenario(part.strip()) for part in text.split(",")))
+
+
+def _some_of(known: tuple[str, ...]) -> Callable[[str], tuple[str, ...]]:
+    """Return a parser of all or some of the known names, each once."""
+
+    def parse(text: str) -> tuple[str, ...]:
+        if text == "all":
+            return known
+        for name in names(text):
+            if name not in known:
+                raise argparse.ArgumentTypeError(
+                    f'is "{text}", it must be all or some of {", ".join(known)}'
+                )
+        return tuple(dict.fromkeys(names(text)))
+
+    return parse
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValidateOptions:
+    """Options of `driveby validate`, of all kinds together."""
+
+    scenarios: tuple[int, ...] = opt(
+        "scenarios of the paper (default: all)",
+        _scenarios,
+        default=tuple(SCENARIOS),
+        metavar="all|1,6,12",
+    )
+    noise: float = noise_option("accelerometers' noise density in µg/√Hz (default: 0)")
+    site: Path | None = site_option(
+        "truck and bridge (default: those of the paper); without --method: makes a certificate "
+        "for every pair of them (exit code 1 if one fails)"
+    )
+    json: Path | None = output_option(
+        "JSON file of the table", "OUT.json", VALIDATION_JSON, AIMS_JSON
+    )
+    figures: Path | None = output_folder_option("folder for figures")
+    particles: int = opt("number of particles (default: 500)", whole("particles", 1), default=500)
+    steps: int = opt("number of steps (default: 600)", whole("steps", 1), default=600)
+    seed: int = seed_option()
+    method: str | None = opt(
+        "paper: its search and least squares, without sensors; pre: is its uncertainty true "
+        "(exit code 1 if an aim is missed; the options below) (default: paper, and with --site "
+        "neither, but certificates)",
+        choices=("paper", "pre"),
+    )
+    truck: str | None = opt(
+        "identifier of the only vehicle to validate (default: each)", group=_OF_SITE, metavar="ID"
+    )
+    bridge: str | None = opt(
+        "identifier of the only bridge to validate (default: each)", group=_OF_SITE, metavar="ID"
+    )
+    validations: Path | None = validations_option(
+        f"folder for certificates (default: {CERTIFICATES})", group=_OF_SITE
+    )
+    crossings: int = opt(
+        "number of crossings whose truth is drawn from the priors (default: 200)",
+        whole("a number of crossings", 0),
+        default=200,
+    )
+    control: int = opt(
+        "number of them repeated with half the noise declared (default: 20)",
+        whole("a number of crossings", 0),
+        default=20,
+    )
+    out_of_model: int = opt(
+        "number of crossings for each out-of-model effect (default: 0)",
+        whole("a number of crossings", 0),
+        default=0,
+    )
+    effects: tuple[str, ...] = opt(
+        f"of {', '.join(EFFECTS)} (default: all)",
+        _some_of(EFFECTS),
+        default=EFFECTS,
+        metavar="all|swing,friction,…",
+    )
+    records: Path = output_option(
+        "file of finished crossings of --out-of-model and --surveys, which are not run again "
+        "(default: build/worlds.jsonl)",
+        "FILE.jsonl",
+        RECORDS,
+        default=Path("build/worlds.jsonl"),
+    )
+    surveys: int = opt(
+        "number of fused surveys, of 8 to 16 crossings, for each of --kinds; nothing else "
+        "is run then (default: 0)",
+        whole("a number of surveys", 0),
+        default=0,
+    )
+    kinds: tuple[str, ...] = opt(
+        f"of {', '.join(_KINDS)} (default: all)",
+        _some_of(_KINDS),
+        default=_KINDS,
+        metavar="all|twin,steady,…",
+    )
+    truth: Path = opt(
+        "folders of crossings with a truth.json (default: ../shared/crossings)",
+        Path,
+        default=Path("../shared/crossings"),
+        metavar="DIR",
+    )
+    processes: int = opt("number of processes (default: 2)", whole("processes", 1, 256), default=2)
+    page: Path | None = output_option("Markdown page of the findings", "PAGE.md", VALIDATION_PAGE)
+
+
+def _validate(asked: ValidateOptions) -> int:
+    if asked.site is not None and asked.method is None:
+        from services.cli.validate_site import validate_site_command
+
+        _refuse(asked, _OF_METHODS - _OF_CERTIFICATES, "only with --method")
+        asked = replace(asked, validations=asked.validations or CERTIFICATES)
+        return validate_site_command(_of_kind(CertificateOptions, asked), a_console())
+    _refuse(asked, _OF_CERTIFICATES - _OF_METHODS, "only with --site, no --method")
+    code: int
+    if asked.method == "pre" and asked.surveys:
+        run_surveys = _study("validation.run_surveys")
+        code = run_surveys.run(_of_kind(SurveyOptions, asked), a_console())
+    elif asked.method == "pre":
+        run_intervals = _study("validation.run_intervals")
+        code = run_intervals.run(_of_kind(IntervalOptions, asked), a_console())
+    else:
+        paper = _study("paper.run")
+        code = paper.run(_of_kind(ScenarioOptions, asked), a_console())
+    return code
+
+
+def _refuse(asked: ValidateOptions, others: frozenset[str], what: str) -> None:
+    """Raise InputError if an option of another kind of validation was given."""
+    for field in fields(asked):
+        if field.name in others and getattr(asked, field.name) != field.default:
+            raise InputError(
+                f"{option_of(field.name)}: {what}, it has nothing to do with what is asked for"
+            )
+
+
+def _of_kind(kind: type[_Options], asked: ValidateOptions) -> _Options:
+    """Return the options of one kind of validation."""
+    return kind(**{field.name: getattr(asked, field.name) for field in fields(kind)})
+
+
+def _study(module: str) -> ModuleType:
+    """Import a module of the checkout's studies; InputError where there is no checkout."""
+    if not (_CHECKOUT / "studies").is_dir():
+        raise InputError(
+            "driveby validate runs from a checkout of the source only; the installed program has "
+            "the validation of a site: --site SITE.toml without --method"
+        )
+    if str(_CHECKOUT) not in sys.path:
+        sys.path.insert(0, str(_CHECKOUT))
+    return import_module(f"studies.{module}")
+
+
+VALIDATE: Final = Subcommand(
+    "validate",
+    ValidateOptions,
+    "identify simulated crossings and compare them with the truth and the paper",
+    "driveby validate --scenarios 1,6,12 --noise 25 --json validation.json",
+    _validate,
+)

@@ -1,0 +1,220 @@
+"""Options of `driveby simulate`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from services.common.options import (
+    flag,
+    force_option,
+    noise_option,
+    number,
+    numbers,
+    opt,
+    recording_option,
+    scenario,
+    seed_option,
+    site_option,
+    whole,
+)
+
+_TRUTH: Final = "truth"
+_RECEIVER: Final = "receiver"
+_RUNS: Final = "several runs"
+_SURFACE: Final = "two-dimensional road surface"
+_BEYOND: Final = "effects that a site file does not declare (default: none)"
+
+
+def _ratios(text: str) -> tuple[float, ...]:
+    ratio = number("ratios", low=1e-3, high=1e3)
+    return tuple(ratio(part) for part in text.split(","))
+
+
+def _speed_range(text: str) -> tuple[float, float]:
+    speed = number("a speed in m/s (or START:END)", low=0.1, high=60)
+    start, _, end = text.partition(":")
+    return speed(start), speed(end if ":" in text else start)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulateOptions:
+    """Options of `driveby simulate`: truth, drive, effects and the recording."""
+
+    scenario: int | None = opt(
+        "damage scenario of the paper, 1 to 12",
+        scenario,
+        alternatives=_TRUTH,
+        required=True,
+        metavar="N",
+    )
+    ei: tuple[float, ...] | None = opt(
+        "flexural rigidity of each element over its undamaged value",
+        _ratios,
+        alternatives=_TRUTH,
+        required=True,
+        metavar="1,1,.4,…",
+    )
+    site: Path | None = site_option("truck and bridge (default: those of the paper)")
+    axles: int | None = opt(
+        "axles of the truck; 3: a loaded tipper with an equalised tandem, unless the site's "
+        "truck has one (default: the site's truck, or 2)",
+        int,
+        choices=(2, 3),
+    )
+    road: str = opt("ISO 8608 class (default: A)", default="A", choices=tuple("ABCDE"))
+    seed: int = seed_option()
+    noise: float = noise_option("accelerometers' noise density in µg/√Hz (default: 0)")
+    speed: tuple[float, float] = opt(
+        "speed in m/s, or START:END for a constant acceleration (default: 10)",
+        _speed_range,
+        default=(10.0, 10.0),
+        metavar="M_PER_S",
+    )
+    direction: str = opt(
+        "direction of travel (default: start_to_end)",
+        default="start_to_end",
+        choices=("start_to_end", "end_to_start"),
+    )
+    gps_noise: bool = flag("simulate the errors of a real GNSS receiver", alternatives=_RECEIVER)
+    perfect_gps: bool = flag(
+        "simulate exact positions and speeds (default)", alternatives=_RECEIVER
+    )
+    rate: float | None = opt(
+        "sampling rate (default: the site's, or 1000)",
+        number("a rate in Hz", low=50, high=50_000),
+        metavar="HZ",
+    )
+    runs: int = opt(
+        "number of runs over the same road, ten minutes apart, in one recording (default: 1)",
+        whole("a number of runs", 1, 100),
+        group=_RUNS,
+        default=1,
+    )
+    days: int = opt(
+        "number of days with these runs each, in one recording (default: 1)",
+        whole("a number of days", 1, 1000),
+        group=_RUNS,
+        default=1,
+    )
+    start: str | None = opt(
+        "start of the first run, ISO 8601 with a zone (default: 2026-01-01T00:00:00Z)",
+        group=_RUNS,
+        metavar="TIME",
+    )
+    drive_seed: int | None = opt(
+        "seed of noise and lateral position (default: --seed, which also seeds the road)",
+        whole("a seed", 0),
+        group=_SURFACE,
+        metavar="SEED",
+    )
+    road_surface: bool = flag(
+        "simulate a 2-D road surface, so that the axles follow different profiles "
+        "(default: one profile for both)",
+        group=_SURFACE,
+    )
+    tyres: str | None = opt(
+        "tyres of the rear axle, on a 2-D surface (default: the site's, or twin)",
+        group=_SURFACE,
+        choices=("single", "twin"),
+    )
+    rear_offset: float | None = opt(
+        "lateral offset of the rear from the front axle in m, on a 2-D surface (default: "
+        "the site's, or 0.005)",
+        number("an offset in m", low=-1, high=1),
+        group=_SURFACE,
+        metavar="M",
+    )
+    wander: float | None = opt(
+        "lateral standard deviation between runs in m, on a 2-D surface (default: 0)",
+        number("a standard deviation in m", low=0, high=2),
+        group=_SURFACE,
+        metavar="M",
+    )
+    deck_roughness: float | None = opt(
+        "roughness on the bridge over that off it, on a 2-D surface (default: 1)",
+        number("a factor", low=0.1, high=10),
+        group=_SURFACE,
+        metavar="FACTOR",
+    )
+    joints: float | None = opt(
+        "largest height in mm of a dip or step at each end of the bridge, on a 2-D surface "
+        "(default: 0)",
+        number("a height in mm", low=0, high=50),
+        group=_SURFACE,
+        metavar="MM",
+    )
+    anisotropy: float | None = opt(
+        "lateral correlation length over that of an isotropic surface, on a 2-D surface "
+        "(default: 1)",
+        number("a factor", low=0.2, high=20),
+        group=_SURFACE,
+        metavar="FACTOR",
+    )
+    support_springs: tuple[float, float] = opt(
+        "rotational stiffness of the supports in N·m/rad",
+        numbers("rotational stiffnesses in N·m/rad (START:END)", (0, 1e13), (0, 1e13)),
+        group=_BEYOND,
+        default=(0.0, 0.0),
+        metavar="START:END",
+    )
+    bearing_stiffness: tuple[float, float] | None = opt(
+        "vertical stiffness of the bearings in N/m",
+        numbers("vertical stiffnesses in N/m (START:END)", (1e7, 1e15), (1e7, 1e15)),
+        group=_BEYOND,
+        metavar="START:END",
+    )
+    departed_vehicle: tuple[float, float, float] | None = opt(
+        "weight and speed of a vehicle that left S seconds before the truck came",
+        numbers(
+            "a weight in N, a speed in m/s and seconds before (N:M_PER_S:S)",
+            (0, 1e7),
+            (0.5, 60),
+            (0, 1000),
+        ),
+        group=_BEYOND,
+        metavar="N:M_PER_S:S",
+    )
+    friction: float = opt(
+        "suspension friction over the static load",
+        number("a share of the springs' load", low=0, high=0.5),
+        group=_BEYOND,
+        default=0.0,
+        metavar="SHARE",
+    )
+    friction_growth: float = opt(
+        "share of the friction that grows with the load; 1: proportional",
+        number("a growth with the load", low=0, high=1),
+        group=_BEYOND,
+        default=0.0,
+        metavar="SHARE",
+    )
+    bilinear: float = opt(
+        "damper asymmetry: stronger in rebound, weaker in compression by this share",
+        number("a share", low=0, high=0.9),
+        group=_BEYOND,
+        default=0.0,
+        metavar="SHARE",
+    )
+    air_springs: float = opt(
+        "polytropic exponent of air springs; 1.38 is usual",
+        number("a polytropic exponent", low=1, high=2),
+        group=_BEYOND,
+        default=0.0,
+        metavar="EXPONENT",
+    )
+    lane_offset: float | None = opt(
+        "distance of the lane's middle to the left of the bridge's axis, looking from start "
+        "to end; with --torsion the deck twists under it (default: the site's, or 0)",
+        number("a distance in m", low=-20, high=20),
+        group=_BEYOND,
+        metavar="M",
+    )
+    torsion: tuple[float, float] | None = opt(
+        "first torsional over first bending frequency of the deck and its radius of "
+        "gyration, with a lane offset (2:2.3 is usual; default: the site's, or no twist)",
+        numbers("a frequency ratio and a radius of gyration in m (RATIO:M)", (0.2, 100), (0.1, 30)),
+        group=_BEYOND,
+        metavar="RATIO:M",
+    )
+    output: Path = recording_option(required=True)
+    force: bool = force_option()
