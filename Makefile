@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
+# Else pytest rewrites every test, and each process of a test compiles its modules, in every run.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help install demo up down test test-all faults containers soak day year mutants validate lint tables docs dist matrix coverage bench lock clean
 

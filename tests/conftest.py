@@ -1,6 +1,8 @@
 """What several tests need."""
 
+import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +24,20 @@ settings.load_profile("project")
 
 PROJECT = Path(__file__).parents[1]
 pytest_plugins = ["tests.groups", "tests.left_out"]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Search for garbage neither during the collection nor among the collected tests later.
+
+    The tests live to the end, so each search would be in vain; a third of the collection was that.
+    """
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.fixture(scope="session")
