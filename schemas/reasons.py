@@ -85,7 +85,9 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
         "The truck reports values of its own that differ from the site file."
     ),
     Reason.OTHER_TRUCK_ON_BRIDGE: "Another truck was on the bridge at the same time.",
-    Reason.SPEED_TOO_LOW: "The truck was too slow for its axles to feel the bridge's stiffness.",
+    Reason.SPEED_TOO_LOW: (
+        "The truck was so slow that the bridge's stiffness hardly affects its axles."
+    ),
     Reason.STOPPED_ON_BRIDGE: "The truck stopped or turned back on the bridge.",
     Reason.ACCELERATING_CG_UNKNOWN: (
         "The truck braked or accelerated and the height of its centre of gravity is unknown."
@@ -101,9 +103,10 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.NO_NOISE_MODEL: "The method has no noise model, so it provides no valid intervals.",
     Reason.MODEL_MISFIT: "The model does not explain the measured accelerations.",
     Reason.RESIDUALS_COLOURED: "The residuals are not random noise.",
-    Reason.NOISE_ABOVE_DECLARED: "The accelerometers are noisier than the site file says.",
+    Reason.NOISE_ABOVE_DECLARED: "The accelerometers are noisier than the site file declares.",
     Reason.NOISE_BELOW_DECLARED: (
-        "The accelerometers are much quieter than the site file says, which could hide a misfit."
+        "The accelerometers are much quieter than the site file declares, which could hide a "
+        "misfit."
     ),
     Reason.IMPLAUSIBLE_VEHICLE: "The estimated truck parameters contradict the site file.",
     Reason.TANDEM_FRICTION: (
@@ -119,7 +122,8 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
         "can cause."
     ),
     Reason.COMMON_DISTURBANCE: (
-        "All sensors share a disturbance that is not vertical motion, as tilted sensors do."
+        "All sensors share a disturbance that is not vertical motion, such as that of tilted "
+        "sensors."
     ),
     Reason.IMPLAUSIBLE_BRIDGE: (
         "An element is so much stiffer than its nominal value and than the others that no damage "
@@ -175,7 +179,7 @@ LEFT_OUT_TEXTS: Final[dict[str, str]] = {
     LeftOutReason.SUSPECT: "suspect",
     LeftOutReason.DISAGREES: "disagrees with the others beyond its uncertainty",
     LeftOutReason.OTHER_MODEL: "was identified with other elements or parameters",
-    LeftOutReason.NO_LIKELIHOOD: "an older result, without what fusion needs",
+    LeftOutReason.NO_LIKELIHOOD: "an older result without the data that fusion needs",
     LeftOutReason.NOT_FUSED: "this method's results are not fused",
 }
 

@@ -117,7 +117,7 @@ def test_report_page_shows_months_elements_and_alarms(past: BridgeHistory) -> No
     assert f"{newest.mean / usual:.3f} 5 " in found.text
     assert found.tags.count("figure") == 1
     assert history_summary(past) == (
-        "34 crossings in 2 months; not watched for changes (see the bridge over time)"
+        "34 crossings in 2 months; not monitored for changes (see the page on the bridge over time)"
     )
 
 
@@ -199,16 +199,16 @@ def test_an_alarm_stands_until_somebody_has_taken_note_of_it(past: BridgeHistory
     said = "element 4 is 20 % weaker than before 2026-03-05, interval 18 to 22 %."
     standing = past._replace(alarms=(alarm(),))
     text = Seen(history_section(standing, "h-")).text
-    assert f"Alarm of 2026-03-10: {said} It stands: it is not acknowledged." in text
-    assert "; an alarm stands (see" in history_summary(standing)
+    assert f"Alarm of 2026-03-10: {said} The alarm is active: it is not acknowledged." in text
+    assert "; 1 active alarm (see" in history_summary(standing)
     note = Acknowledgement(by="<b>Anna</b>", time=BEGIN_S + 9 * DAY_S, note="frozen")
     noted = past._replace(alarms=(alarm().model_copy(update={"acknowledged": note}),))
     found = Seen(history_section(noted, "h-"))
     assert f"{said} <b>Anna</b> acknowledged it on 2026-03-11: frozen" in found.text
     assert "b" not in found.tags  # what somebody wrote is text
-    assert "; not watched for changes (see" in history_summary(noted)
+    assert "; not monitored for changes (see" in history_summary(noted)
     both = past._replace(alarms=(alarm(), alarm()))
-    assert "; 2 alarms stand (see" in history_summary(both)
+    assert "; 2 active alarms (see" in history_summary(both)
 
 
 def test_the_command_puts_the_page_behind_the_first(
@@ -224,7 +224,7 @@ def test_the_command_puts_the_page_behind_the_first(
     words += ["--site", str(project / "docs/site.example.toml")]
     assert cli.main([*words, "--history", str(tmp_path / "history")]) == 0
     text = Seen(output.read_text()).text
-    assert "Over time 3 crossings in 1 month; not watched for changes" in text
+    assert "Over time 3 crossings in 1 month; not monitored for changes" in text
     places = [text.index(word) for word in ("What this does not mean", "The bridge over time",
                                             "Evidence: all crossings")]  # fmt: skip
     assert places == sorted(places)

@@ -210,10 +210,10 @@ def test_unresolved_elements_are_never_said_to_agree() -> None:
     assert describe_comparison(found) == sentences(found)
     assert describe_comparison(found, frozenset({1, 5}), LEVEL) == [
         "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements, interval 57 to 63 %.",
-        "The loss may as well be in element 5, beside it and not resolved.",
+        "The loss may also be in element 5, which is adjacent and not resolved.",
         "Elements 1 and 5 are not resolved (standard deviation above 25 %).",
         "Elsewhere only losses above 16 % would show.",
-        "As a whole the bridge is at 0.90 of nominal ± 10 %.",
+        "The overall stiffness is 0.90 of the nominal value ± 10 %.",
     ]
     sound = compared(np.ones(7))
     assert describe_comparison(sound, frozenset({7})) == [

@@ -45,7 +45,7 @@ def test_numbers_are_written_as_in_the_language() -> None:
     assert GERMAN.number(-1234.5, ",.1f") == "−1.234,5"
     assert ENGLISH.number(-1234.5, ",.1f") == "−1,234.5"
     assert GERMAN.text("level", mean=0.97, std=10.0).startswith(
-        "Als Ganzes liegt die Brücke beim 0,97"
+        "Die Steifigkeit der ganzen Brücke beträgt das 0,97"
     )
 
 

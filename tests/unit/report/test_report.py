@@ -76,21 +76,23 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
         "No other element differs clearly (at most 3 %); only losses above 16 % would show." in text
     )
     assert (
-        "Bridge 30 m, 7 elements from its start, the south-west end (36.11060° N, 140.10100° E)"
+        "Bridge 30 m, 7 elements, counted from the south-west end (36.11060° N, 140.10100° E)"
         in text
     )
-    assert "2026-09-21 to 2026-09-22, by truck-1" in text
-    assert "2 crossings: 2 good. The numbers below are of the newest usable one." in text
+    assert "2026-09-21 to 2026-09-22, with truck-1" in text
+    assert "2 crossings: 2 good. The numbers below are from the newest usable one." in text
     assert "The other good crossing agrees with them: at most 0.0 standard deviations apart" in text
     assert "class A of ISO 8608, IRI 2.4 m/km" in text
     assert "not a condition rating" in text
     assert "Have element 4 (12.9 to 17.1 m from the south-west end) inspected." in text
-    assert "Was it built unlike the others? Then the difference is no damage." in text
+    assert (
+        "If it was built differently from the other elements, the difference is not damage." in text
+    )
     assert "Drive again on another day, in the other direction and with another truck:" in text
     assert "Keep these results as a baseline" in text
     # Where there is no baseline that is said, and what it means.
     assert "each other (no baseline is stored)" in text
-    assert "A loss that all elements share cannot be detected without a baseline." in text
+    assert "A loss that affects all elements equally cannot be detected without a baseline." in text
     # The evidence.
     assert "misfit (χ² per degree of freedom) 1.02 1.02 of the residuals" in text
     assert "suspension weight (%) 100 100 100 %" in text
@@ -108,7 +110,7 @@ def test_a_nominal_value_that_is_too_high_is_no_damage_everywhere(site: Site) ->
     text = reported(site, sound).text
     assert "No element is clearly less stiff." in text
     assert "No element differs clearly from the others (at most 1 %); only losses above" in text
-    assert "The median of all is 0.86 of the nominal value" in text
+    assert "The median of all elements is 0.86 of the nominal value" in text
 
 
 def test_a_baseline_shows_what_all_elements_share(site: Site, tmp_path: Path) -> None:
@@ -126,7 +128,7 @@ def test_a_baseline_shows_what_all_elements_share(site: Site, tmp_path: Path) ->
     assert last in text
     assert ", and at the bearing there inspected." in text
     assert "Keep these results" not in text
-    assert "built unlike" not in text
+    assert "built differently" not in text
     assert "No baseline is stored" not in text
     assert "compare surveys of" not in reported(site, now).text
     unchanged = reported(site, results_of(site, some_crossing("b"), used="b"), baseline=then).text
@@ -146,8 +148,8 @@ def test_before_and_after_stand_beside_each_other_with_the_change(
     now = results_of(site, some_crossing("z", entry=9e6), used="z", ratios=ratios)
     found = reported(site, now, baseline=then)
     assert (
-        "Compared with the baseline then.json: 3 crossings on 2026-09-21, by truck-1, a "
-        "measurement that is good" in found.text
+        "Compared with the baseline then.json: 3 crossings on 2026-09-21, with truck-1; this "
+        "measurement is good" in found.text
     )
     assert "Element From–to (m) Before (GN·m²) After (GN·m²) Change (95 % interval)" in found.text
     old = earlier.bridges[site.bridges[0].id].elements["EI_4"]
@@ -185,7 +187,7 @@ def test_every_finding_has_a_next_step(site: Site) -> None:
         assert report.finding.kind == kind
         assert list(next_steps(report, ENGLISH)), kind
     twins = reported(site, kinds["open"]).text
-    assert "Use a truck with equal single tyres on all axles or with an equalised tandem" in twins
+    assert "use a truck with equal single tyres on all axles or with an equalised tandem" in twins
 
 
 def test_a_suspect_result_is_doubtful_and_says_why(site: Site) -> None:
@@ -194,7 +196,7 @@ def test_a_suspect_result_is_doubtful_and_says_why(site: Site) -> None:
     assert ("class", "finding doubtful") in found.attributes
     assert "Doubtful. Do not rely on these values." in found.text
     assert f"The reasons: {REASON_TEXTS[Reason.POSITION_OUTAGE]}" in found.text
-    assert "Check the satellite receiver and its antenna." in found.text
+    assert "Check the GNSS receiver and its antenna." in found.text
     assert "less stiff?" in found.text
     assert ("class", "weak") not in found.attributes
 
@@ -208,11 +210,11 @@ def test_all_rejected_crossings_give_the_reasons(site: Site) -> None:
     found = reported(site, results_of(site, *rejected))
     assert "No statement on this bridge is possible." in found.text
     assert (
-        "The truck was too slow for its axles to feel the bridge's stiffness. (2 of 2)"
+        "The truck was so slow that the bridge's stiffness hardly affects its axles. (2 of 2)"
         in found.text
     )
     assert "Drive again, at 5 m/s or more." in found.text
-    assert "neither that the bridge is sound nor that it is damaged" in found.text
+    assert "neither that the bridge is undamaged nor that it is damaged" in found.text
     assert found.tags.count("svg") == 1  # the sketch, and no picture without a number
     assert "GN·m²" not in found.text
 
@@ -221,7 +223,7 @@ def test_inconsistent_crossings_are_reported(site: Site) -> None:
     one = results_of(site, some_crossing("a"), used="a")
     other = results_of(site, some_crossing("b", entry=60.0), used="b", ratios=1.5 * RATIOS)
     merged = other.model_copy(update={"crossings": one.crossings + other.crossings})
-    assert "does NOT agree with them: at most 9.6 standard" in reported(site, merged).text
+    assert "does NOT agree with them: up to 9.6 standard" in reported(site, merged).text
 
 
 def test_what_single_crossings_say_of_a_weak_element_shows_how_far_they_scatter(
@@ -234,7 +236,7 @@ def test_what_single_crossings_say_of_a_weak_element_shows_how_far_they_scatter(
     third = results_of(site, some_crossing("c", verdict="suspect", reasons=("position_outage",)))
     everything = one.crossings + other.crossings + third.crossings
     merged = other.model_copy(update={"crossings": everything})
-    said = "By each of the 2 good crossings alone, element 4 is 50 to 60 % less stiff; all"
+    said = "From each of the 2 good crossings alone, element 4 is 50 to 60 % less stiff; the"
     assert said in reported(site, merged).text
     assert "crossings alone" not in reported(site, one).text
 
@@ -499,8 +501,8 @@ def test_on_paper_the_first_page_of_an_end_that_is_weak_is_one_sheet(
 def test_fused_crossings_are_listed_with_their_agreement(site: Site) -> None:
     text = reported(site, fused(site, KNOWN, left_out=("suspect", "disagrees"))).text
     assert "One element is clearly less stiff." in text
-    assert "The numbers below are of all 3 together, a measurement that is good." in text
-    assert "Left out: 1 suspect; 1 disagrees with the others beyond its uncertainty." in text
+    assert "The numbers below combine all 3; this measurement is good." in text
+    assert "Excluded: 1 suspect; 1 disagrees with the others beyond its uncertainty." in text
     assert "Between-crossing variability of EI: 1.2 % (0.0 to 4.0 %)" in text
     assert "confirms them" not in text
 
@@ -510,17 +512,17 @@ def test_a_state_that_is_suspect_is_doubtful_though_its_crossings_are_good(site:
     found = reported(site, fused(site, KNOWN, **reasons))
     assert ("class", "finding doubtful") in found.attributes
     assert "The reasons: Crossings disagree by more than their uncertainty" in found.text
-    assert "a measurement that is suspect" in found.text
+    assert "this measurement is suspect" in found.text
 
 
 def test_a_loss_beside_unresolved_elements_may_be_theirs(site: Site) -> None:
     text = reported(site, fused(site, [0.6, 0.4, 0.3, 0.05, 0.1, 0.1, 0.5])).text
     assert "Less stiff near element 4; the exact element is uncertain." in text
-    assert "The loss may as well be in element 3, beside it and not resolved." in text
+    assert "The loss may also be in element 3, which is adjacent and not resolved." in text
     assert (
         "Elements 1, 2, 3 and 7 are not resolved (standard deviation above 25 %). "
         "Elsewhere only losses above 40 % would show. "
-        "As a whole the bridge is at 0.97 of nominal ± 10 %." in text
+        "The overall stiffness is 0.97 of the nominal value ± 10 %." in text
     )
     assert "differs clearly" not in text  # of what is known to a factor nothing is stated
     assert text.count("not resolved") == 2 + 4  # in words, and in the table
@@ -530,7 +532,7 @@ def test_where_no_element_is_resolved_none_is_called_sound(site: Site) -> None:
     found = reported(site, fused(site, [0.6] * 7))
     assert ("class", "finding open") in found.attributes
     assert (
-        "Only the stiffness of the whole bridge could be determined, not that of elements."
+        "Only the stiffness of the whole bridge could be determined, not that of single elements."
         in found.text
     )
     assert "No single element is resolved" in found.text
@@ -562,10 +564,10 @@ def test_a_measurement_that_could_have_missed_a_loss_does_not_reassure(
     )
     assert 10 < int(seen[0]) <= int(seen[1])
     assert int(seen[1]) > 20
-    assert "Omit or postpone no inspection because of this measurement" in found.text
+    assert "Do not omit or postpone an inspection because of this measurement" in found.text
     assert "driveby survey computes" in found.text
     assert "equalised tandem" in found.text
-    assert "No inspection follows" not in found.text
+    assert "no additional inspection" not in found.text
     german = reported(site, sound, language="de").text
     assert "Lassen Sie wegen dieser Messung keine Prüfung aus" in german
     assert f"erst ab {seen[1]} %" in german
@@ -578,7 +580,7 @@ def test_a_finding_is_sound_only_up_to_the_loss_that_surveys_plan_for(site: Site
         (report,) = bridge_reports([(Path("x.json"), results, site)], None)
         assert report.finding.kind == kind
         steps = " ".join(next_steps(report, ENGLISH))
-        assert ("No inspection follows" in steps) == (kind == "sound")
+        assert ("no additional inspection" in steps) == (kind == "sound")
 
 
 def test_elements_that_cannot_be_compared_are_not_called_sound(site: Site) -> None:
@@ -587,7 +589,7 @@ def test_elements_that_cannot_be_compared_are_not_called_sound(site: Site) -> No
     assert found.kind == "open"
     alone = view._replace(finding=found, view=view.view._replace(comparison=None))
     steps = " ".join(next_steps(alone, ENGLISH))
-    assert "Omit or postpone no inspection" in steps
+    assert "Do not omit or postpone an inspection" in steps
     assert "Drive over the bridge more often" not in steps
 
 
