@@ -43,7 +43,7 @@ class FittedValues(NamedTuple):
     uses_suspension: bool
     """Whether the suspension equations had their full weight."""
     lines_hz: tuple[float, ...] = ()
-    """Frequencies of hum that was taken out."""
+    """Frequencies of the removed hum."""
 
 
 class FittedResiduals(NamedTuple):

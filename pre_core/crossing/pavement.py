@@ -9,7 +9,7 @@ bridge that are too short for a deflection, so that a weak element does not rese
 the prior of t extends them to long waves. The noise has the expectation of the power under their
 posterior, exp(2 (r + t L) + 2 L'CL), so that what the short waves leave open widens the intervals.
 
-A joint at an end of the deck is felt by both axles; what differs is local. Where the residuals at
+A joint at an end of the deck excites both axles; only local waves differ. Where the residuals at
 an end exceed the noise, all local waves there are removed from the whitened residuals.
 """
 

@@ -102,7 +102,7 @@ class PosteriorProblem(NamedTuple):
     noise_slope: FloatArray  # of the first coordinates: see `all_rows`
     works: tuple[Buffers, ...]
     lines_hz: tuple[float, ...] = ()
-    """Frequencies at the rows of the lines that are taken out of them, see `lines`."""
+    """Frequencies in the rows of the removed lines, see `lines`."""
     line_waves: FloatArray = np.zeros((0, 0))
     """(m, w) orthonormal waves of these lines."""
 
@@ -317,7 +317,7 @@ def log_odds_of_absence(problem: PosteriorProblem, inflation: float = 1.0) -> Fl
 
 
 def log_odds(absence: FloatArray, inflation: float = 1.0) -> FloatArray:
-    """Return ln[P / ((1 - P) 2 phi(0))] of probabilities P (k,), beside a half-normal prior."""
+    """Return ln[P / ((1 - P) 2 phi(0))] of probabilities P (k,), for a half-normal prior."""
     with np.errstate(divide="ignore"):
         return np.asarray(
             np.log(absence) - np.log1p(-absence) + 0.5 * np.log(0.5 * np.pi * inflation**2)

@@ -36,9 +36,9 @@ def sinc_table() -> FloatArray:
     """Return weights (phases + 1, 2, taps) that interpolate signals between two samples.
 
     Row p interpolates at p/phases of the way from sample taps/2 - 1 to the next; the second axis
-    has the weights and their slopes per phase, for smooth cubics between the rows. A sinc in
-    The Kaiser window: images of the model's signals (up to channels.STOP of the rate) begin at 1 -
-    STOP.
+    has the weights and their slopes per phase, for smooth cubics between the rows. It is a
+    sinc in a Kaiser window: images of the model's signals (up to channels.STOP of the rate) begin
+    at 1 - STOP.
     """
     phase = np.arange(PHASES + 1) / PHASES
     step = 1e-4

@@ -4,8 +4,9 @@ Its coordinates x are those of y, with c = EI_nominal/EI in place of ln EI and t
 place of its logarithm: deflections are linear in c, and the decay of a vibration nearly so in the
 damping. The density is a normal likelihood in x times the exact priors: log-normal, half-normal,
 and point masses of absence. It starts as the Gauss-Newton approximation at the optimum. Where draws
-of it have been weighted by the posterior, a quadratic regression of the log weights moves and bends
-the normal likelihood (cf. Opper and Archambeau 2009), so that the next draws weigh more alike.
+of it have been weighted by the posterior, a quadratic regression of the log weights shifts and
+reshapes the normal likelihood (cf. Opper and Archambeau 2009), so that the weights of the next
+draws vary less.
 
 Over its own draws such a regression minimises KL(surrogate || posterior), which neglects what they
 seldom reach: a few draws keep large weights. Later regressions count draws by the square root of

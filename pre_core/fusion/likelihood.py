@@ -79,7 +79,7 @@ class Coordinates(NamedTuple):
 class OffBridgeMismatch(NamedTuple):
     """Mismatch in m at begin_m, begin_m + `OFF_BRIDGE_STEP_M`, …; NaN where it is unknown.
 
-    It is scaled to the level on the bridge, where the pavement may be another one.
+    It is scaled to the level on the bridge, where the pavement may differ.
     """
 
     begin_m: float

@@ -1,8 +1,8 @@
 """Checks of a fit: the reasons not to trust its estimate.
 
 `pre_core.diagnostics` measures; this module holds the thresholds, each with the values measured on
-sound and on faulty crossings (studies/faults.md). `signal_checks` holds the checks that need the
-signals alone.
+fault-free and on faulty crossings (studies/faults.md). `signal_checks` holds the checks that need
+the signals alone.
 """
 
 from typing import NamedTuple
@@ -141,7 +141,7 @@ class Fit(NamedTuple):
 
 
 def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
-    """Return the reasons not to trust a fit, the most significant first; none if it is sound."""
+    """Return the reasons not to trust a fit, the most significant first; none if it is reliable."""
     reasons = [Reason.TANDEM_FRICTION] if fit.tandem_friction > _TANDEM_FRICTION else []
     reasons += _of_the_rows(data, fit)
     is_unexplained = bool({Reason.MODEL_MISFIT, Reason.RESIDUALS_COLOURED} & set(reasons))

@@ -85,7 +85,7 @@ def draw_posterior(scenario: Scenario, names: Sequence[str]) -> Figure:
         figure,
         height,
         f"Scenario {scenario.number}: {describe(scenario)}",
-        "Probability density of the random walk's particles over value / sound value",
+        "Probability density of the random walk's particles over value / undamaged value",
         [
             Patch(facecolor=PRIOR, label="prior"),
             Patch(facecolor=WALK, alpha=0.75, label="after the random walk"),
@@ -167,7 +167,7 @@ def draw_overview(scenarios: Sequence[Scenario], published: dict[str, Any] | Non
         if place % columns:
             axes.tick_params(labelleft=False)
         else:
-            axes.set_ylabel("EI / sound EI")
+            axes.set_ylabel("EI / undamaged EI")
         if place + columns < len(scenarios):
             axes.tick_params(labelbottom=False)
         else:
@@ -246,7 +246,7 @@ def describe(scenario: Scenario) -> str:
     rigidities = {n.removeprefix("EI_"): r for n, r in scenario.truth.items() if n[:3] == "EI_"}
     weak = [element for element, ratio in rigidities.items() if ratio != 1.0]
     if not weak:
-        return "sound"
+        return "undamaged"
     ratios = {rigidities[element] for element in weak}
     value = "/".join(f"{ratio:g}" for ratio in sorted(ratios))
     if len(weak) == len(rigidities):

@@ -94,8 +94,8 @@ _SCENARIOS = """
 
 One crossing each at 10 m/s over a road of class A with the errors of a receiver (1.5 m slow, 0.4
 m and 0.07 m/s white); the truck is the site file's. Road and noise are drawn for each scenario, its
-number being the seed. EI over the sound value, mean ± standard deviation; the paper's Table 7 (no
-noise, exact position; its ± is the spread of particles) beside it.
+number being the seed. EI over the undamaged value, mean ± standard deviation; the paper's Table 7
+(no noise, exact position; its ± is the spread of particles) next to it.
 
 | scenario | element | truth | paper | {columns} |
 | --: | --- | --: | --: | {rules} |

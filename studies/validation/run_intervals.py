@@ -111,7 +111,7 @@ def print_outcome(console: "Console", outcome: ValidationOutcome, all_checks: li
         for text in reasons_of(outcome.drawn):
             console.print(f"  {text}", highlight=False)
     if outcome.scenarios:
-        console.print("[bold]the paper's scenarios, EI / sound EI[/]", highlight=False)
+        console.print("[bold]the paper's scenarios, EI / undamaged EI[/]", highlight=False)
         shown = table(
             "scenario", "element", "truth", "paper", *(f"{n:g} µg" for n in noises(outcome))
         )

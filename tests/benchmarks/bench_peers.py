@@ -1,8 +1,8 @@
 """How soon other searches find all twenty parameters on the same J from the same range.
 
 Every method gets the scenario's noise-free J through our batch kernel on two threads, searches in
-logarithms of the ratios to the sound values, and starts where the paper's particles do. A run ends
-when the best vector so far has S_A >= 0.99 in all twenty rows of the paper's tables, or after
+logarithms of the ratios to the undamaged values, and starts where the paper's particles do. A run
+ends when the best vector so far has S_A >= 0.99 in all twenty rows of the paper's tables, or after
 300,000 evaluations. The settings are the best of a handful that were tried for each method.
 """
 

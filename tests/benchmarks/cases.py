@@ -38,7 +38,7 @@ def particles(count: int, seed: int = 0) -> Floats:
 
 
 def start_ratios(count: int, seed: int = 0) -> Floats:
-    """Ratios (count, 19) to the sound values, uniform in 0.8 to 1.2."""
+    """Ratios (count, 19) to the undamaged values, uniform in 0.8 to 1.2."""
     rng = np.random.default_rng(seed)
     return rng.uniform(random_walk.PRIOR_LOW, random_walk.PRIOR_HIGH, (count, FREE.size))
 

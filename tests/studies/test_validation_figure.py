@@ -159,7 +159,7 @@ def test_fewer_parameters_leave_no_empty_panel() -> None:
 def test_scenarios_are_described_in_words() -> None:
     described = {n: describe(scenario(n)) for n in (1, 3, 6, 8)}
     assert described == {
-        1: "sound",
+        1: "undamaged",
         3: "all elements at 0.8",
         6: "element 4 at 0.4",
         8: "elements 5 and 6 at 0.7",
