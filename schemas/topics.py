@@ -80,7 +80,7 @@ TOPICS: tuple[Topic, ...] = (
     ),
     Topic(
         "vehicle", "gnss", "driveby.v1.GnssFix", True, False, 10.0, "reliable",
-        3000, 100_000, 1 << 12, "one fix of the satellite receiver, with its accuracies",
+        3000, 100_000, 1 << 12, "one fix of the GNSS receiver, with its accuracies",
     ),
     Topic(
         "vehicle", "location", "foxglove.LocationFix", True, False, 10.0, "reliable",
@@ -92,7 +92,7 @@ TOPICS: tuple[Topic, ...] = (
     ),
     Topic(
         "vehicle", "alive", "", False, False, None, "reliable",
-        0, 1_000, 0, "liveliness token: there while the truck's gateway runs",
+        0, 1_000, 0, "liveliness token: present while the truck's gateway runs",
     ),
     Topic(
         "bridge", "crossing", "driveby.v1.Crossing", True, False, None, "reliable",
@@ -108,15 +108,15 @@ TOPICS: tuple[Topic, ...] = (
     ),
     Topic(
         "bridge", "alarm", "driveby.v1.Alarm", True, True, None, "reliable",
-        1, 1_000, 1 << 14, "the bridge has changed; stands until somebody acknowledges it",
+        1, 1_000, 1 << 14, "the bridge has changed; active until it is acknowledged",
     ),
     Topic(
         "service", "health", "driveby.v1.Health", False, False, 1 / HEALTH_PERIOD_S, "latest",
-        1, 1_000, 1 << 16, "how a service is: rate, lag, queue, lost, recovered, disk left",
+        1, 1_000, 1 << 16, "state of a service: rate, lag, queue, lost, recovered, disk left",
     ),
     Topic(
         "service", "progress", "driveby.v1.Progress", False, False, None, "latest",
-        1, 1_000, 1 << 12, "how far a service is with a long piece of work",
+        1, 1_000, 1 << 12, "progress of a service's long task",
     ),
     Topic(
         "service", "event", "driveby.v1.Event", True, False, None, "reliable",
@@ -124,7 +124,7 @@ TOPICS: tuple[Topic, ...] = (
     ),
     Topic(
         "service", "durable", "driveby.v1.Durable", False, True, 1.0, "reliable",
-        1, 1_000, 1 << 20, "what a logger has safely on disk, per vehicle, stream and boot",
+        1, 1_000, 1 << 20, "messages that a logger has on disk, per vehicle, stream and boot",
     ),
 )  # fmt: skip
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 def alarm_line(alarm: "Alarm") -> str:
     """Return the printed line of an alarm."""
     note = alarm.acknowledged
-    state = "stands" if note is None else f"acknowledged by {note.by} on {day(note.time)}"
+    state = "active" if note is None else f"acknowledged by {note.by} on {day(note.time)}"
     said = f": {note.note}" if note is not None and note.note else ""
     return one_line(
         f"alarm {alarm.alarm_id} of {alarm.bridge}, raised {day(alarm.raised)}, {state}{said}; "

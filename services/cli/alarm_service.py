@@ -74,7 +74,7 @@ def serve(
         def put(alarm: Alarm, payload: bytes) -> None:
             publisher = publishers.setdefault(alarm.realm, Publisher(session, alarm.realm))
             publisher.put("bridge", alarm.bridge, "alarm", payload)
-            state = "acknowledged" if alarm.acknowledged else "stands"
+            state = "acknowledged" if alarm.acknowledged else "active"
             print(f"{alarm.bridge}: {alarm.sentence()}: {state}", flush=True)
 
         alarms = AlarmPublisher(put)

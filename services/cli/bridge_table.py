@@ -95,7 +95,7 @@ def print_elements(
         table.add_column(heading, justify="right")
     if has_meaning:
         table.add_column("95 % interval", justify="right")
-    table.add_column("of nominal", justify="right")
+    table.add_column("EI/nominal", justify="right")
     if has_meaning and not losses:  # the loss is more important, and a line has 80 characters
         table.add_column("95 % interval", justify="right")
     percents = list(next(iter(losses.values()))) if losses else []

@@ -165,7 +165,7 @@ def _found(
 def check_certificates(certificates: Path | None) -> None:
     """Raise InputError for an invalid folder of validation records."""
     if certificates is not None and not certificates.is_dir():
-        raise InputError(f"--validations: {certificates} is no folder of certificates")
+        raise InputError(f"--validations: {certificates} is not a folder of validation records")
 
 
 def warn_of_no_noise(site: Site, method: str) -> None:

@@ -37,7 +37,7 @@ _MAX_SERVICES: Final = 50
 _STATES: Final = {
     pb.DETECTED: "on the bridge",
     pb.COMPLETE: "complete",
-    pb.WAITING_NOT_VALIDATED: "waits for a certificate",
+    pb.WAITING_NOT_VALIDATED: "waits for validation",
     pb.IDENTIFYING: "identifying",
     pb.DONE: "done",
 }
@@ -285,9 +285,9 @@ def _weight(alarm: Alarm) -> tuple[bool, float]:
 
 
 def alarm_state(alarm: Alarm) -> str:
-    """Return whether an alarm stands, or who acknowledged it."""
+    """Return whether an alarm is active, or who acknowledged it."""
     note = alarm.acknowledged
-    return "stands" if note is None else f"acknowledged by {one_line(note.by)}"
+    return "active" if note is None else f"acknowledged by {one_line(note.by)}"
 
 
 def service_figures(service: ServiceRow) -> str:

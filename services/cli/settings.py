@@ -47,7 +47,7 @@ class IdentifyOptions:
     baseline: Path | None = baseline_option()
     fuse_suspect: bool = fuse_suspect_option()
     validations: Path | None = validations_option(
-        f"folder of the certificates that results refer to (default: {CERTIFICATES})"
+        f"folder of the validation records that results name (default: {CERTIFICATES})"
     )
     seed: int = seed_option()
     into: Path | None = output_folder_option(

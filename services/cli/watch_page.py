@@ -226,7 +226,7 @@ def _alarms(alarms: Iterable[Alarm], most: int) -> list[Text]:
     ]
     if len(known) > most:
         standing = sum(one.acknowledged is None for one in known[most:])
-        more = f"  and {len(known) - most} more alarms, of which {standing} stand"
+        more = f"  and {len(known) - most} more alarms, {standing} of them active"
         lines.append(Text(more, style="red" if standing else "dim"))
     return lines
 

@@ -152,7 +152,7 @@ def _sentence(state: State, record: WatchRecord) -> str:
     unit = record.period
     match state:
         case "alarm":
-            return "An alarm stands: nothing else is judged until it is acknowledged."
+            return "An alarm is active: nothing else is judged until it is acknowledged."
         case "out_of_date":
             return (
                 f"Not watched since {day_of(record.checked)}: crossings were added after "

@@ -19,7 +19,7 @@ from services.common.options import (
 if TYPE_CHECKING:
     from services.logger.writer import RotationLimits
 
-_ROOM = "files and room"
+_ROOM = "files and disk space"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -49,7 +49,7 @@ class Fusion(NamedTuple):
                 )
                 for (element, one), sound in zip(state.elements.items(), nominal, strict=True)
             ]
-            head = ("element", "EI (GN·m²)", "95 % interval", "of nominal")
+            head = ("element", "EI (GN·m²)", "95 % interval", "EI/nominal")
             parts.append(f"<p>{escape(self._line(name))}</p>{html_table(head, rows)}")
         return "".join(parts)
 

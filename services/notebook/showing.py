@@ -58,7 +58,7 @@ def as_html(crossing: CrossingResult, bridge: Bridge) -> str:
         start_m += length_m
     if rows:
         parts.append(
-            html_table(("element", "m", "EI (GN·m²)", "95 % interval", "of nominal"), rows)
+            html_table(("element", "m", "EI (GN·m²)", "95 % interval", "EI/nominal"), rows)
         )
     return "".join(parts)
 

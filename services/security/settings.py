@@ -25,13 +25,13 @@ class CertsSettings:
         "roles to add, e.g. viewer/anna", names, default=(), metavar="ROLE/NAME,…"
     )
     host: Sequence[str] = opt(
-        "names and addresses of the machines of router and logger, besides this machine",
+        "names and addresses of the machines of router and logger, in addition to this machine",
         default=(),
         nargs="+",
         metavar="NAME",
     )
     days: int = opt(
-        "how long the new certificates are valid (default: 365)",
+        "validity of the new certificates in days (default: 365)",
         whole("days", 1, 3650),
         default=365,
         metavar="N",

@@ -89,7 +89,7 @@ def _picture(history: HistoryView) -> NDArray[np.uint8]:
 def _history_text(history: HistoryView) -> str:
     lines = [f"# {history.bridge}", ""]
     for mark in history.marks:
-        state = f"noted by {mark.acknowledged}" if mark.acknowledged else "stands"
+        state = f"noted by {mark.acknowledged}" if mark.acknowledged else "active"
         lines.append(f"- Alarm of {datetime.fromtimestamp(mark.raised_s, UTC):%Y-%m-%d}, {state}: "
                      f"{mark.sentence}")  # fmt: skip
     for wording in history.statements:

@@ -29,7 +29,7 @@ class ViewSettings:
         "a .mcap, .json or .rrd file; live: the messages on the bus",
         metavar="REC|RESULT|RRD|live",
     )
-    web: bool = flag("in the browser")
+    web: bool = flag("open in the browser")
     endpoint: str | None = endpoint_option(group=_LIVE)
     tls: Path | None = tls_option(group=_LIVE)
     realm: str = realm_option(group=_LIVE)
@@ -40,7 +40,7 @@ class ViewSettings:
         "serve only; viewers that connect later receive the buffered history", group=_LIVE
     )
     listen: str = opt(
-        f"where viewers connect (default: {LOOPBACK}, this machine only)",
+        f"address for viewers (default: {LOOPBACK}, this machine only)",
         default=LOOPBACK,
         group=_LIVE,
         metavar="ADDRESS",

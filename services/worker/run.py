@@ -127,7 +127,7 @@ def _check(asked: WorkerSettings) -> None:
     if asked.records_are_required and not METHODS[asked.search_method].has_noise_model:
         method = asked.search_method.replace("_", "-")
         raise InputError(
-            f"--method {method}: has no certificates, which realm live and --validate-first "
+            f"--method {method}: has no site validation, which realm live and --validate-first "
             "ask for; take pre, or --skip-validation"
         )
 

@@ -136,7 +136,7 @@ def _guard_engine(outputs: Iterable[Output]) -> Iterator[Output]:
     try:
         yield from outputs
     except ValueError as error:
-        _log.error("internal error", exc_info=True)
+        _log.error("the engine failed; ending this worker", exc_info=True)
         raise FailureError(f"a crossing could not be processed: {error}") from error
 
 

@@ -31,7 +31,7 @@ class WorkerSettings:
     endpoint: str | None = endpoint_option()
     tls: Path | None = tls_option()
     realm: str = realm_option()
-    site: Path = site_option("trucks and bridges", required=True)
+    site: Path = site_option("site file of trucks and bridges", required=True)
     folder: Path = folder_option("folder of the results")
     file: Path | None = output_option("single new file for the results (and .json)", "RESULTS.mcap")
     method: str = method_option()
@@ -58,7 +58,7 @@ class WorkerSettings:
         "identify in realm live without site validation", alternatives=_VALIDATION
     )
     certificates: Path | None = validations_option(
-        "folder of certificates (default: certificates in --folder)"
+        "folder of validation records (default: certificates in --folder)"
     )
     recordings: Path | None = opt(
         "folder of the logger's recordings, for crossings that trucks no longer send "
@@ -67,7 +67,7 @@ class WorkerSettings:
         metavar="DIR",
     )
     recordings_days: float = opt(
-        "age in days of the oldest recordings to catch up from (default: 2; 0: none)",
+        "age in days of the oldest recordings for backfill (default: 2; 0: none)",
         number("days", low=0, high=3650),
         default=2.0,
         metavar="DAYS",

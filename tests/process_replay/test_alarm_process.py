@@ -229,7 +229,7 @@ def test_history_reaches_the_watchers(
     start_logger(start, endpoint, tmp_path / "live.mcap")
     site = ["--site", str(project / "docs/site.example.toml")]
     serve = ["alarm", "serve", "--history", str(history), "--endpoint", endpoint]
-    stands = r"alarm of bridge-1: element 4 is \d+ % weaker than before 2025-04.*: stands$"
+    stands = r"alarm of bridge-1: element 4 is \d+ % weaker than before 2025-04.*: active$"
     noted = r"alarm of bridge-1: element 4 is .*: acknowledged by the owner$"
     with (
         RunningCommand("watch", *realm) as early,
@@ -248,12 +248,12 @@ def test_history_reaches_the_watchers(
 
         assert not any(shown())
         with RunningCommand(*serve) as serving:
-            serving.says("bridge-1: element 4 is .*: stands")
+            serving.says("bridge-1: element 4 is .*: active")
             early.says(stands)
             with RunningCommand("watch", *realm) as late:
                 late.says(stands)
             with terminal("watch", *realm) as screen:
-                drawn(screen, r"\x1b\[1;31malarm of bridge-1: stands; element 4 is")
+                drawn(screen, r"\x1b\[1;31malarm of bridge-1: active; element 4 is")
             until(lambda: shown()[-1], "the alarm in the viewer")
             words = ["alarm", "ack", "bridge-1", "--by", "the owner", "--note", "props"]
             done = subprocess.run(
@@ -264,7 +264,7 @@ def test_history_reaches_the_watchers(
             early.says(noted)
             with RunningCommand("watch", *realm) as late:
                 late.says(noted)
-                assert not any(line.endswith(": stands") for line in late.lines)
+                assert not any(line.endswith(": active") for line in late.lines)
             until(
                 lambda: any(texts := shown()) and not texts[-1],
                 "the viewer without it",

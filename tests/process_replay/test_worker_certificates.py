@@ -189,7 +189,7 @@ def test_a_worker_makes_the_certificate_itself(
 
 
 def test_other_methods_have_no_certificates(endpoint: str, site: Path) -> None:
-    with pytest.raises(InputError, match=r"^--method least-squares: has no certificates"):
+    with pytest.raises(InputError, match=r"^--method least-squares: has no site validation"):
         run_worker(
             WorkerSettings(
                 endpoint=endpoint,

@@ -172,7 +172,7 @@ def _acknowledge(options: AlarmOptions, bridge: str) -> int:
         print(problem)
     standing = [alarm for alarm in alarms if alarm.acknowledged is None]
     if not standing:
-        raise InputError(f"{options.history}: no alarm of {bridge} stands")
+        raise InputError(f"{options.history}: {bridge} has no active alarm")
     for alarm in standing:
         noted = acknowledge(options.history, alarm, options.by, options.note, time.time())
         print(alarm_line(noted))
@@ -180,7 +180,7 @@ def _acknowledge(options: AlarmOptions, bridge: str) -> int:
 
 
 def _realm_of(folder: Path, bridge: str, realm: str | None) -> str:
-    """Return the realm of a bridge's alarms; they stand whatever happened to its crossings."""
+    """Return the realm of a bridge's alarms; they outlive its crossings."""
     from services.history.alarm_files import bridges_with_alarms
     from services.history.history_store import realm_of
 

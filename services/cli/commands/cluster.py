@@ -28,7 +28,7 @@ class ClusterOptions:
         "port of the scheduler (default: 8786)", whole("a port", 1, 65535), default=8786
     )
     listen: str = opt(
-        f"of this machine; any other than {LOOPBACK} needs --tls (default: {LOOPBACK})",
+        f"address to listen on; any other than {LOOPBACK} needs --tls (default: {LOOPBACK})",
         default=LOOPBACK,
         metavar="ADDRESS",
     )

@@ -58,7 +58,7 @@ class HistoryOptions:
     )
     rrd: Path | None = output_option("Rerun file of EI over time", "OUT.rrd", RERUN)
     view: bool = flag("open EI over time in the Rerun viewer")
-    web: bool = flag("open it in the browser")
+    web: bool = flag("open EI over time in the browser")
     sql: str | None = opt("query of the table crossings (DuckDB)", metavar="SELECT …")
 
 

@@ -22,7 +22,7 @@ class RecoverOptions:
 
     recording: Path = positional("recording to rewrite; left as it is", Path, metavar="REC.mcap")
     output: Path | None = output_option(
-        "recording to write (default: REC.recovered.mcap beside it)",
+        "recording to write (default: REC.recovered.mcap next to it)",
         "OUT.mcap",
         MCAP,
         flags=("-o", "--output"),

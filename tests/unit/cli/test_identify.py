@@ -405,4 +405,7 @@ def test_a_certificate_that_there_is_is_named(
     capsys.readouterr()
     assert cli.main([*identify, "--validations", str(tmp_path / "none")]) == 2
     line = capsys.readouterr().err
-    assert line == f"driveby: --validations: {tmp_path / 'none'} is no folder of certificates\n"
+    assert (
+        line
+        == f"driveby: --validations: {tmp_path / 'none'} is not a folder of validation records\n"
+    )

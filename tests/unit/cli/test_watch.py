@@ -206,7 +206,7 @@ def test_an_alarm_is_a_line_until_it_is_another(site: Site) -> None:
         deliver(watched, one) for one in (alarm(), alarm(), alarm(by="owner"), alarm(by="owner"))
     ]
     assert said == [
-        f"alarm of bridge-1: {SENTENCE}: stands",
+        f"alarm of bridge-1: {SENTENCE}: active",
         None,
         f"alarm of bridge-1: {SENTENCE}: acknowledged by owner",
         None,
@@ -219,12 +219,12 @@ def test_alarms_that_stand_come_first_on_the_page(site: Site) -> None:
         deliver(watched, alarm(f"old-{number}", by="owner", raised=1.7899e9 + number))
     deliver(watched, alarm())
     lines = drawn(watched)
-    assert lines[1] == f"alarm of bridge-1: stands; {SENTENCE}"
+    assert lines[1] == f"alarm of bridge-1: active; {SENTENCE}"
     assert lines[2] == f"alarm of old-4: acknowledged by owner; {SENTENCE}"
-    assert "  and 2 more alarms, of which 0 stand" in lines
+    assert "  and 2 more alarms, 0 of them active" in lines
     for number in range(5):
         deliver(watched, alarm(f"new-{number}"))
-    assert "  and 7 more alarms, of which 2 stand" in drawn(watched)
+    assert "  and 7 more alarms, 2 of them active" in drawn(watched)
     assert len(drawn(watched, 80, 24)) <= 26
 
 

@@ -291,7 +291,7 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     assert cli.main(["alarm", "list", *there]) == 0
     assert how not in capsys.readouterr().out
     assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", *there]) == 2
-    assert capsys.readouterr().err == f"driveby: {history}: no alarm of bridge-2 stands\n"
+    assert capsys.readouterr().err == f"driveby: {history}: bridge-2 has no active alarm\n"
     assert cli.main(["alarm", "ack", "bridge-2", *there]) == 2
     assert "--by NAME" in capsys.readouterr().err
     assert cli.main(["alarm", "check", "bridge-2", *there]) == 2
@@ -383,6 +383,6 @@ def test_an_alarm_stands_though_its_crossings_are_gone(
     assert cli.main(["alarm", "list", *there]) == 0
     assert "of bridge-2, raised" in capsys.readouterr().out
     assert cli.main(["alarm", "check", "--all", *there]) == 0
-    assert "stands; element 4" in capsys.readouterr().out
+    assert "active; element 4" in capsys.readouterr().out
     assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", *there]) == 0
     assert standing_alarms(history) == ([], [])
