@@ -50,7 +50,7 @@ class ImportOptions:
         group=_TABLES,
     )
     write_map: Path | None = output_option(
-        "file of all that was found, for --map", "MAP.toml", IMPORT_MAP, group=_TABLES
+        "file to write the guessed map to, for --map", "MAP.toml", IMPORT_MAP, group=_TABLES
     )
     map: Path | None = file_option(
         "map of files, columns, units and times to read by", "MAP.toml", group=_TABLES

@@ -164,7 +164,7 @@ class SimulateOptions:
         metavar="START:END",
     )
     departed_vehicle: tuple[float, float, float] | None = opt(
-        "weight and speed of a vehicle that left S seconds before the truck came",
+        "weight and speed of a vehicle that left S seconds before the truck entered",
         numbers(
             "a weight in N, a speed in m/s and seconds before (N:M_PER_S:S)",
             (0, 1e7),

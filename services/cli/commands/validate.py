@@ -47,7 +47,7 @@ _OF_METHODS: Final = frozenset(
 )
 
 
-_OF_SITE: Final = "certificates of --site, see docs/worker.md"
+_OF_SITE: Final = "site validation of --site, see docs/worker.md"
 _KINDS: Final = tuple(KINDS)
 
 
@@ -85,7 +85,7 @@ class ValidateOptions:
     )
     noise: float = noise_option("accelerometers' noise density in µg/√Hz (default: 0)")
     site: Path | None = site_option(
-        "truck and bridge (default: those of the paper); without --method: makes a certificate "
+        "truck and bridge (default: those of the paper); without --method: site validation "
         "for every pair of them (exit code 1 if one fails)"
     )
     json: Path | None = output_option(
@@ -96,9 +96,9 @@ class ValidateOptions:
     steps: int = opt("number of steps (default: 600)", whole("steps", 1), default=600)
     seed: int = seed_option()
     method: str | None = opt(
-        "paper: its search and least squares, without sensors; pre: is its uncertainty true "
+        "paper: its search and least squares, without sensors; pre: coverage of its intervals "
         "(exit code 1 if an aim is missed; the options below) (default: paper, and with --site "
-        "neither, but certificates)",
+        "neither, but site validation)",
         choices=("paper", "pre"),
     )
     truck: str | None = opt(
@@ -108,7 +108,7 @@ class ValidateOptions:
         "identifier of the only bridge to validate (default: each)", group=_OF_SITE, metavar="ID"
     )
     validations: Path | None = validations_option(
-        f"folder for certificates (default: {CERTIFICATES})", group=_OF_SITE
+        f"folder for validation records (default: {CERTIFICATES})", group=_OF_SITE
     )
     crossings: int = opt(
         "number of crossings whose truth is drawn from the priors (default: 200)",
@@ -126,7 +126,7 @@ class ValidateOptions:
         default=0,
     )
     effects: tuple[str, ...] = opt(
-        f"of {', '.join(EFFECTS)} (default: all)",
+        f"effects: {', '.join(EFFECTS)} (default: all)",
         _some_of(EFFECTS),
         default=EFFECTS,
         metavar="all|swing,friction,…",
@@ -145,7 +145,7 @@ class ValidateOptions:
         default=0,
     )
     kinds: tuple[str, ...] = opt(
-        f"of {', '.join(_KINDS)} (default: all)",
+        f"kinds of survey: {', '.join(_KINDS)} (default: all)",
         _some_of(_KINDS),
         default=_KINDS,
         metavar="all|twin,steady,…",
