@@ -21,7 +21,7 @@ from schemas.metrics import METRICS
 from schemas.reasons import BRIDGE_REASON_TEXTS, LEFT_OUT_TEXTS
 from schemas.topics import TOPICS, Topic
 from services.cli import main as cli
-from services.cli.needs import NEEDS, Needs
+from services.cli.table import COMMANDS, ListedCommand
 from services.common.extras import EXTRAS
 from services.common.language import ENGLISH
 
@@ -107,7 +107,7 @@ _PAGES = {
 
 
 def _parsers() -> tuple[argparse.ArgumentParser, Any]:
-    whole = cli._parser()
+    whole = cli.whole_parser()
     (commands,) = [a for a in whole._actions if isinstance(a, argparse._SubParsersAction)]
     return whole, commands
 
@@ -127,14 +127,14 @@ def commands() -> str:
     for name, one in found.choices.items():
         own = _code(option for option in _options(one) if option not in common)
         link = f"[{_PAGES[name].split('.')[0]}]({_PAGES[name]})" if name in _PAGES else ""
-        rows.append((f"`driveby {name}`", summaries[name], own, _needed(NEEDS[name]), link))
+        rows.append((f"`driveby {name}`", summaries[name], own, _needed(COMMANDS[name]), link))
     every = [set(one._option_string_actions) for one in found.choices.values()]
     shared = _code(option for option in common if all(option in one for one in every))
     head = ("command", "purpose", "options", "[extras](install.md)", "page")
     return f"{_table(head, rows)}\nEvery command also takes {shared}.\n"
 
 
-def _needed(needs: Needs) -> str:
+def _needed(needs: ListedCommand) -> str:
     always = " ".join(f"`{extra}`" for extra in needs.always)
     by_extras: dict[tuple[str, ...], list[str]] = {}
     for option, extras in needs.by_option.items():

@@ -4,6 +4,8 @@ import argparse
 import shlex
 from typing import Final
 
+from services.cli.parsing import Parser
+
 SHELLS: Final = ("bash", "zsh")
 
 _SCRIPT = """\
@@ -37,7 +39,7 @@ _ZSH = "autoload -Uz compinit bashcompinit\ncompinit\nbashcompinit\n"
 
 def completion(parser: argparse.ArgumentParser, shell: str) -> str:
     """Return a script for `bash`, or `zsh`, which accepts that of bash, for all of `parser`."""
-    commands = _commands(parser)
+    commands = commands_of(parser)
     everything = {"": parser, **commands}
     script = _SCRIPT.format(
         commands="|".join(commands),
@@ -57,7 +59,8 @@ def completion(parser: argparse.ArgumentParser, shell: str) -> str:
     return script if shell == "bash" else _ZSH + script
 
 
-def _commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+def commands_of(parser: argparse.ArgumentParser) -> dict[str, Parser]:
+    """Return the parsers of the commands."""
     (found,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     return dict(found.choices)
 

@@ -20,73 +20,20 @@ from typing import Final, NoReturn
 
 from services.cli.announcing import subject_of
 from services.cli.closed_pipe import outliving_output, to_null
-from services.cli.commands.alarm import ALARM
-from services.cli.commands.catalog import CATALOG
-from services.cli.commands.certs import CERTS
-from services.cli.commands.check import CHECK
-from services.cli.commands.cluster import CLUSTER
-from services.cli.commands.demo import DEMO
-from services.cli.commands.export import EXPORT
-from services.cli.commands.fuse import FUSE
-from services.cli.commands.gateway import GATEWAY
-from services.cli.commands.health import HEALTH
-from services.cli.commands.history import HISTORY
-from services.cli.commands.identify import IDENTIFY
-from services.cli.commands.import_drive import IMPORT
-from services.cli.commands.info import INFO
-from services.cli.commands.logger import LOGGER
-from services.cli.commands.recover import RECOVER
-from services.cli.commands.replay import REPLAY
-from services.cli.commands.report import REPORT
-from services.cli.commands.simulate import SIMULATE
-from services.cli.commands.survey import SURVEY
-from services.cli.commands.truck import TRUCK
-from services.cli.commands.validate import VALIDATE
-from services.cli.commands.view import VIEW
-from services.cli.commands.watch import WATCH
-from services.cli.commands.worker import WORKER
-from services.cli.completion import SHELLS, completion
-from services.cli.needs import check_needs
+from services.cli.completion import SHELLS, commands_of, completion
+from services.cli.parser import add_command
 from services.cli.parsing import Files, Handler, Parser, add_common, files_of
+from services.cli.table import COMMANDS, check_needs, name_of
 from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
 from services.common.files import check_kind, is_unicode, name_error
 from services.common.log_lines import configure_logging
 from services.common.outputs import declared
 
 _OBJECTS_BETWEEN_LOOKS: Final = 20_000
-_SERVICES: Final = tuple(one.handle for one in (LOGGER, WORKER, TRUCK, GATEWAY, CLUSTER))
-"""Handlers that run until they are stopped, and whose log is their only output."""
+_SERVICES: Final = ("logger", "worker", "truck", "gateway", "cluster")
+"""Commands that run until they are stopped, and whose log is their only output."""
 _COUNTS_AT_EXIT: Final = ("_duckdb", "duckdb")
 """Modules made with nanobind, whose types are in cycles that a last collection frees."""
-_COMMANDS: Final = (
-    SURVEY.add,
-    CHECK.add,
-    SIMULATE.add,
-    IMPORT.add,
-    IDENTIFY.add,
-    FUSE.add,
-    HISTORY.add,
-    ALARM.add,
-    INFO.add,
-    CATALOG.add,
-    EXPORT.add,
-    REPORT.add,
-    VALIDATE.add,
-    RECOVER.add,
-    VIEW.add,
-    DEMO.add,
-    LOGGER.add,
-    WORKER.add,
-    TRUCK.add,
-    GATEWAY.add,
-    REPLAY.add,
-    WATCH.add,
-    HEALTH.add,
-    CLUSTER.add,
-    CERTS.add,
-)
-"""Commands in the order of `driveby --help`."""
-
 _LARGEST_CHECKED: Final = 1 << 20
 """Maximum size in bytes of a site file that is read once more for warnings."""
 EXIT_FAILED: Final = 1
@@ -130,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _print_error(str(error), EXIT_BAD_INPUT)
     is_json = options.log_format == "json"
     # The log is a service's only output.
-    verbose = options.verbose or options.handler in _SERVICES
+    verbose = options.verbose or name_of(options) in _SERVICES
     level = logging.INFO if verbose else logging.WARNING
     configure_logging(options.log_format, level, subject_of(options))
     fail = partial(_print_error, is_json=is_json)
@@ -221,8 +168,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_common(parser, suppressed=False)
     commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    for add in _COMMANDS:
-        add(commands)
+    for name in COMMANDS:
+        add_command(commands, name)
+    return parser
+
+
+def whole_parser() -> argparse.ArgumentParser:
+    """Return the parser with the options of every command."""
+    parser = _parser()
+    for command in commands_of(parser).values():
+        command.complete()
     return parser
 
 
@@ -243,10 +198,8 @@ def _print_error(line: str, code: int, *, is_json: bool = False) -> int:
 
 
 class _Completion(argparse.Action):
-    def __call__(
-        self, parser: argparse.ArgumentParser, _: object, value: object, __: object = None
-    ) -> NoReturn:
-        print(completion(parser, str(value)), end="")
+    def __call__(self, _: object, __: object, value: object, ___: object = None) -> NoReturn:
+        print(completion(whole_parser(), str(value)), end="")
         sys.exit(0)
 
 

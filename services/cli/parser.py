@@ -4,10 +4,13 @@ import argparse
 from collections.abc import Callable
 from dataclasses import MISSING, fields
 from functools import partial
+from importlib import import_module
 from typing import Any, Generic, NamedTuple, TypeVar
 
+from services.cli import commands
 from services.cli.announcing import announcement
-from services.cli.parsing import command
+from services.cli.parsing import Parser, add_common
+from services.cli.table import COMMANDS
 from services.common.options import OPTION, Option
 
 _Asked = TypeVar("_Asked")
@@ -17,16 +20,13 @@ Announce = Callable[[str], Callable[[], None]]
 class Subcommand(NamedTuple, Generic[_Asked]):
     """A command: the class of its options, and the function that runs it with an instance."""
 
-    name: str
     options: type[_Asked]
-    summary: str
     example: str
     run: Callable[[_Asked], int]
 
-    def add(self, commands: Any) -> None:
-        """Add the command to a parser."""
-        parser = command(commands, self.name, self.handle, self.summary, self.example)
-        _add_fields(parser, self.options)
+    def fill(self, parser: Parser) -> None:
+        """Add the options to the parser of the command."""
+        _fill(parser, self)
 
     def handle(self, given: argparse.Namespace) -> int:
         """Run the command with what was given."""
@@ -36,21 +36,44 @@ class Subcommand(NamedTuple, Generic[_Asked]):
 class ServiceCommand(NamedTuple, Generic[_Asked]):
     """A command that runs until it is stopped, and whose log is its only output."""
 
-    name: str
     options: type[_Asked]
-    summary: str
     example: str
     run: Callable[[_Asked, Announce], int]
     """Function of the options and of a function that announces a line."""
 
-    def add(self, commands: Any) -> None:
-        """Add the command to a parser."""
-        parser = command(commands, self.name, self.handle, self.summary, self.example)
-        _add_fields(parser, self.options)
+    def fill(self, parser: Parser) -> None:
+        """Add the options to the parser of the command."""
+        _fill(parser, self)
 
     def handle(self, given: argparse.Namespace) -> int:
         """Run the command with what was given."""
         return self.run(_filled(self.options, given), partial(announcement, given))
+
+
+def add_command(subparsers: Any, name: str) -> Parser:
+    """Add a command of the table; its options are added when it is parsed."""
+    summary, *_, module = COMMANDS[name]
+    parser: Parser = subparsers.add_parser(
+        name,
+        help=summary,
+        description=f"{summary[0].upper()}{summary[1:]}.",
+        allow_abbrev=False,
+    )
+    parser.put_off(lambda: _command(module or name).fill(parser), name)
+    return parser
+
+
+def _command(module: str) -> "Subcommand[Any] | ServiceCommand[Any]":
+    found: Subcommand[Any] | ServiceCommand[Any]
+    found = import_module(f"{commands.__name__}.{module}").COMMAND
+    return found
+
+
+def _fill(parser: Parser, command: "Subcommand[Any] | ServiceCommand[Any]") -> None:
+    parser.epilog = f"example: {command.example}"
+    parser.set_defaults(handler=command.handle, parser=parser)
+    add_common(parser, suppressed=True)
+    _add_fields(parser, command.options)
 
 
 def _add_fields(parser: argparse.ArgumentParser, options: Any) -> None:

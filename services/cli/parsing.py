@@ -44,9 +44,21 @@ class Parser(argparse.ArgumentParser):
 
     former_options: Mapping[str, str] = {}
     """Former spellings of this command's options, with the present ones."""
+    _fill: Callable[[], None] | None = None
+
+    def put_off(self, fill: Callable[[], None], name: str) -> None:
+        """Add the options of the command of this name by `fill`, when they are needed."""
+        self._fill, self.former_options = fill, _FORMER_OPTIONS.get(name, {})
+
+    def complete(self) -> None:
+        """Add the options that were put off."""
+        fill, self._fill = self._fill, None
+        if fill is not None:
+            fill()
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse arguments whose options may have their former spellings."""
+        self.complete()
         given = list(sys.argv[1:] if args is None else args)
         ends = given.index("--") if "--" in given else len(given)
         current = [self._current(one) for one in given[:ends]]
@@ -59,23 +71,6 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise InputError."""
         raise InputError(f"{message} (see {self.prog} --help)")
-
-
-def command(
-    commands: Any, name: str, handler: Handler, summary: str, example: str
-) -> argparse.ArgumentParser:
-    """Return a command with its summary, description and an example."""
-    parser: Parser = commands.add_parser(
-        name,
-        help=summary,
-        description=f"{summary[0].upper()}{summary[1:]}.",
-        epilog=f"example: {example}",
-        allow_abbrev=False,
-    )
-    parser.former_options = _FORMER_OPTIONS.get(name, {})
-    parser.set_defaults(handler=handler, parser=parser)
-    add_common(parser, suppressed=True)
-    return parser
 
 
 def add_common(parser: argparse.ArgumentParser, *, suppressed: bool) -> None:

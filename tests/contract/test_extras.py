@@ -17,7 +17,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 from schemas.site_file import site_toml
 from services.cli import main as cli
-from services.cli.needs import NEEDS
+from services.cli.table import COMMANDS
 from services.common.errors import InputError
 from services.common.extras import EXTRAS, check_extras, check_installed
 from services.simulation.drive import paper_site
@@ -88,10 +88,10 @@ def test_extras_are_those_of_the_project() -> None:
 
 def test_every_command_says_what_it_needs() -> None:
     (commands,) = (
-        action.choices for action in cli._parser()._actions if isinstance(action.choices, dict)
+        action.choices for action in cli.whole_parser()._actions if isinstance(action.choices, dict)
     )
-    assert list(NEEDS) == list(commands)
-    for name, needs in NEEDS.items():
+    assert list(COMMANDS) == list(commands)
+    for name, needs in COMMANDS.items():
         known = {action.dest for action in commands[name]._actions}
         assert {option.partition("=")[0] for option in needs.by_option} <= known
         assert {*needs.always, *(x for more in needs.by_option.values() for x in more)} <= {*EXTRAS}
@@ -99,7 +99,7 @@ def test_every_command_says_what_it_needs() -> None:
 
 def test_the_page_has_every_extra_and_what_commands_need() -> None:
     commands = (ROOT / "docs" / "commands.md").read_text()
-    for name, needs in NEEDS.items():
+    for name, needs in COMMANDS.items():
         (row,) = re.findall(rf"^\| `driveby {name}` \|.*$", commands, re.MULTILINE)
         cell = row.split(" | ")[3]
         for extra in (*needs.always, *(x for more in needs.by_option.values() for x in more)):
@@ -136,7 +136,7 @@ VALUES = {"figure": ["plan.png"], "view": [], "web": [], "format=parquet": ["par
 """Values of options; others take a name."""
 LACKING = [
     (command, option)
-    for command, needs in NEEDS.items()
+    for command, needs in COMMANDS.items()
     for option in ([None] if needs.always else []) + list(needs.by_option)
 ]
 
@@ -149,7 +149,7 @@ def test_a_missing_extra_is_one_line_before_any_work(
     command: str,
     option: str | None,
 ) -> None:
-    needs = NEEDS[command]
+    needs = COMMANDS[command]
     wanted = needs.always if option is None else needs.by_option[option]
     there = {module for extra in {*EXTRAS} - {*wanted} for module in EXTRAS[extra]}
     find = importlib.util.find_spec

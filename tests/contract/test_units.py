@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from services.cli import main as cli
+from services.cli.table import name_of
 
 ROOT = Path(__file__).parents[2]
 UNITS = {path.stem.removeprefix("driveby-"): path for path in (ROOT / "deploy").glob("*.service")}
@@ -66,7 +67,8 @@ def test_unit_starts_its_command(name: str) -> None:
     assert more is not None
     for given in (arguments, [*arguments, *shlex.split(more[1])]):
         options = cli._parser().parse_args(given)
-        assert options.handler in cli._SERVICES
+        assert name_of(options) == name
+        assert name in cli._SERVICES
         assert options.folder == Path("recordings")
         assert options.site == Path("/etc/driveby/site.toml")
     assert service["EnvironmentFile"] == f"-/etc/driveby/{name}.env"

@@ -196,10 +196,8 @@ def _serve(options: AlarmOptions) -> int:
     return serve(options.history, lambda: _checked(options), endpoint, options.tls, every_s)
 
 
-ALARM: Final = Subcommand(
-    "alarm",
+COMMAND: Final = Subcommand(
     AlarmOptions,
-    "detect changed bridges; list, acknowledge and publish alarms",
     "driveby alarm check --history history",
     _alarm,
 )

@@ -136,10 +136,8 @@ def _time(time_ns: int) -> str:
     return f"{datetime.fromtimestamp(time_ns / _NS_PER_S, UTC):%Y-%m-%d %H:%M:%S}"
 
 
-CATALOG: Final = Subcommand(
-    "catalog",
+COMMAND: Final = Subcommand(
     CatalogOptions,
-    "build or repair the catalogue of a folder of recordings and find crossings in it",
     "driveby catalog recordings --site site.toml",
     _catalog,
 )

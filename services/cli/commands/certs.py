@@ -13,10 +13,8 @@ def _certs(asked: CertsSettings) -> int:
     return 0
 
 
-CERTS: Final = Subcommand(
-    "certs",
+COMMAND: Final = Subcommand(
     CertsSettings,
-    "make certificates and access control for a bus between machines",
     "driveby certs certs --trucks truck-1,truck-2 --host logger.example.org",
     _certs,
 )

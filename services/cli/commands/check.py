@@ -135,10 +135,8 @@ def as_json(report: "CheckReport") -> dict[str, Any]:
     }
 
 
-CHECK: Final = Subcommand(
-    "check",
+COMMAND: Final = Subcommand(
     CheckOptions,
-    "check site file, sensors, receiver and bridge coordinates before a survey",
     "driveby check site.toml standstill.mcap trial.mcap",
     _check,
 )

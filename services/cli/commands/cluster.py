@@ -61,10 +61,8 @@ def _cluster(asked: ClusterOptions) -> int:
     return run(ClusterConfig(asked.workers, asked.listen, asked.port, roles, asked.memory))
 
 
-CLUSTER: Final = Subcommand(
-    "cluster",
+COMMAND: Final = Subcommand(
     ClusterOptions,
-    "run a Dask scheduler and workers on this machine, for `identify --scheduler`",
     "driveby cluster --workers 4",
     _cluster,
 )

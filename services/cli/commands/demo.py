@@ -35,10 +35,8 @@ def _demo(asked: DemoOptions) -> int:
     )
 
 
-DEMO: Final = Subcommand(
-    "demo",
+COMMAND: Final = Subcommand(
     DemoOptions,
-    "simulate, publish, record, identify and draw one crossing",
     "driveby demo --speed 4",
     _demo,
 )

@@ -179,10 +179,8 @@ def _site(
     return site
 
 
-EXPORT: Final = Subcommand(
-    "export",
+COMMAND: Final = Subcommand(
     ExportOptions,
-    "write recordings and results as CSV or Parquet tables and GeoJSON",
     "driveby export drive.mcap drive.json --to tables --format parquet",
     _export,
 )

@@ -33,10 +33,8 @@ def _fuse(asked: FuseOptions) -> int:
     return fuse_command(asked, a_console())
 
 
-FUSE: Final = Subcommand(
-    "fuse",
+COMMAND: Final = Subcommand(
     FuseOptions,
-    "fuse the results of many crossings into one estimate of each bridge",
     "driveby fuse monday.json tuesday.json --json week.json",
     _fuse,
 )

@@ -12,10 +12,8 @@ def _gateway(asked: GatewaySettings, announce: Announce) -> int:
     return run(asked, announce(f"ready, listening to ROS 2 at {asked.ros}"))
 
 
-GATEWAY: Final = ServiceCommand(
-    "gateway",
+COMMAND: Final = ServiceCommand(
     GatewaySettings,
-    "publish the data of a ROS 2 truck on the bus",
     "driveby gateway ros2 --ros tcp/127.0.0.1:7447 --endpoint tcp/office:7447 --site site.toml",
     _gateway,
 )

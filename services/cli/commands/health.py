@@ -75,10 +75,8 @@ def _health(options: HealthOptions, announce: Announce) -> int:
     return 0
 
 
-HEALTH: Final = ServiceCommand(
-    "health",
+COMMAND: Final = ServiceCommand(
     HealthOptions,
-    "query the health of a logger or worker over the bus",
     "driveby health logger",
     _health,
 )

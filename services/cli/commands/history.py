@@ -279,10 +279,8 @@ def _json(past: "BridgeHistory") -> str:
     return json.dumps(fields, indent=1) + "\n"
 
 
-HISTORY: Final = Subcommand(
-    "history",
+COMMAND: Final = Subcommand(
     HistoryOptions,
-    "store results over years and show EI of each element over time",
     "driveby history add drive.json --history history && "
     "driveby history bridge-1 --history history",
     _history,

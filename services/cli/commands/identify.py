@@ -19,10 +19,8 @@ def _identify(asked: IdentifyOptions) -> int:
     return identify_command(asked, executing, a_console())
 
 
-IDENTIFY: Final = Subcommand(
-    "identify",
+COMMAND: Final = Subcommand(
     IdentifyOptions,
-    "estimate the flexural rigidity of each element from recordings",
     "driveby identify run.mcap --json result.json --rrd result.rrd",
     _identify,
 )

@@ -59,10 +59,8 @@ def _write_recording(asked: ImportOptions) -> int:
     return 0
 
 
-IMPORT: Final = Subcommand(
-    "import",
+COMMAND: Final = Subcommand(
     ImportOptions,
-    "convert CSV files or ROS 2 recordings of a drive to a recording",
     "driveby import crossings/d1 --site crossings/d1/site.toml -o d1.mcap",
     _import,
 )

@@ -286,10 +286,8 @@ def _size(size_bytes: int) -> str:
     return f"{size_bytes} B"
 
 
-INFO: Final = Subcommand(
-    "info",
+COMMAND: Final = Subcommand(
     InfoOptions,
-    "summarise recordings: trucks, times, rates, gaps, crossings",
     "driveby info recordings/sample/crossing.mcap",
     _info,
 )

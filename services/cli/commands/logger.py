@@ -13,10 +13,8 @@ def _logger(asked: LoggerSettings, announce: Announce) -> int:
     return run(asked, announce(f"ready, listening at {asked.address}"))
 
 
-LOGGER: Final = ServiceCommand(
-    "logger",
+COMMAND: Final = ServiceCommand(
     LoggerSettings,
-    "record all messages of a realm and host the bus router",
     f"driveby logger --listen {DEFAULT_ENDPOINT} --folder recordings --site site.toml",
     _logger,
 )

@@ -56,10 +56,8 @@ def _as_json(target: Path, recovery: "Recovery") -> dict[str, object]:
     return {"recording": str(target)} | recovery._asdict() | {"lossy": recovery.is_lossy}
 
 
-RECOVER: Final = Subcommand(
-    "recover",
+COMMAND: Final = Subcommand(
     RecoverOptions,
-    "rewrite a damaged or truncated recording",
     "driveby recover run.mcap -o whole.mcap",
     _recover,
 )

@@ -19,10 +19,8 @@ def _replay(asked: ReplaySettings) -> int:
     return run(asked, display=terminal if has_terminal() else None, report=_print)
 
 
-REPLAY: Final = Subcommand(
-    "replay",
+COMMAND: Final = Subcommand(
     ReplaySettings,
-    "publish recorded messages again, unchanged, in a realm of their own",
     "driveby replay run.mcap --speed 10",
     _replay,
 )

@@ -94,10 +94,8 @@ def _report(asked: ReportOptions) -> int:
     return 0
 
 
-REPORT: Final = Subcommand(
-    "report",
+COMMAND: Final = Subcommand(
     ReportOptions,
-    "write results as one printable HTML file, and PDF",
     "driveby report drive.json --site site.toml -o report.html",
     _report,
 )

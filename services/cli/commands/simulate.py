@@ -13,10 +13,8 @@ def _simulate(asked: SimulateOptions) -> int:
     return simulate_command(asked, a_console())
 
 
-SIMULATE: Final = Subcommand(
-    "simulate",
+COMMAND: Final = Subcommand(
     SimulateOptions,
-    "write the recording of a simulated crossing",
     "driveby simulate --scenario 6 --noise 25 -o run.mcap",
     _simulate,
 )

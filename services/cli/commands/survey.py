@@ -120,10 +120,8 @@ def _survey(options: SurveyPlanOptions) -> int:
     return 0
 
 
-SURVEY: Final = Subcommand(
-    "survey",
+COMMAND: Final = Subcommand(
     SurveyPlanOptions,
-    "plan a survey: expected accuracy, detection probability, most useful change",
     "driveby survey --site site.toml --loss 0.2 --crossings 12 --figure plan.png",
     _survey,
 )

@@ -12,10 +12,8 @@ def _truck(asked: TruckSettings, announce: Announce) -> int:
     return run(asked)
 
 
-TRUCK: Final = ServiceCommand(
-    "truck",
+COMMAND: Final = ServiceCommand(
     TruckSettings,
-    "publish a recording as a truck that drives now",
     "driveby truck run.mcap --speed 4",
     _truck,
 )

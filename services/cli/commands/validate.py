@@ -207,10 +207,8 @@ def _study(module: str) -> ModuleType:
     return import_module(f"studies.{module}")
 
 
-VALIDATE: Final = Subcommand(
-    "validate",
+COMMAND: Final = Subcommand(
     ValidateOptions,
-    "identify simulated crossings and compare them with the truth and the paper",
     "driveby validate --scenarios 1,6,12 --noise 25 --json validation.json",
     _validate,
 )

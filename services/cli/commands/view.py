@@ -17,10 +17,8 @@ def _view(asked: ViewSettings) -> int:
     return view_command(target=asked.target, web=asked.web, console=a_console())
 
 
-VIEW: Final = Subcommand(
-    "view",
+COMMAND: Final = Subcommand(
     ViewSettings,
-    "open a recording, a result or the live bus in the Rerun viewer",
     "driveby view run.mcap --web",
     _view,
 )

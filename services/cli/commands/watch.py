@@ -114,10 +114,8 @@ def _print_lines(
         stop.wait(_PERIOD_S)
 
 
-WATCH: Final = Subcommand(
-    "watch",
+COMMAND: Final = Subcommand(
     WatchOptions,
-    "show trucks, crossings and results in the terminal as they arrive",
     "driveby watch --realm sim-demo",
     _watch,
 )

@@ -12,10 +12,8 @@ def _worker(asked: WorkerSettings, announce: Announce) -> int:
     return run(asked, announce(f"ready, waiting for crossings in realm {asked.realm}"))
 
 
-WORKER: Final = ServiceCommand(
-    "worker",
+COMMAND: Final = ServiceCommand(
     WorkerSettings,
-    "identify crossings as they happen and publish the results",
     "driveby worker --site site.toml",
     _worker,
 )

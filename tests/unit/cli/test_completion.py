@@ -62,7 +62,7 @@ def test_every_command_and_option_is_in_it(capsys: pytest.CaptureFixture[str]) -
     with pytest.raises(SystemExit):
         cli.main(["--print-completion", "bash"])
     text = capsys.readouterr().out
-    parser = cli._parser()
+    parser = cli.whole_parser()
     (commands,) = (a.choices for a in parser._actions if a.dest == "==SUPPRESS==" and a.choices)
     for name, one in commands.items():
         (line,) = (row for row in text.splitlines() if row.strip().startswith(f"{name}) words="))
