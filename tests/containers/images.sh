@@ -1,12 +1,14 @@
 #!/bin/sh
 # Makes the two images that Dockerfile and compose.yaml take from a registry, where none is within
-# reach: the base image from Debian's packages, the router's from crates.io. Tags are read from the
+# reach: the base image from Debian's packages, the router's from `zenohd`. Tags are read from the
 # files. Images that are there already stay.
 #
 #     sh tests/containers/images.sh [FOLDER]
 #
-# Needs root, debootstrap, cargo and a docker engine; FOLDER keeps the compiled router (default:
-# build/containers). DEBIAN is the mirror, by default the one of this machine's apt.
+# `zenohd` is the program that ZENOHD names, or that of PATH, or is compiled from crates.io into
+# FOLDER (default: build/containers). Without cargo stand_in.py takes its place, or with
+# ZENOHD=tests/containers/stand_in.py. Needs root, debootstrap and a docker engine; DEBIAN is the
+# mirror, by default the one of this machine's apt.
 set -eu
 cd "$(dirname "$0")/../.."
 folder=$(mkdir -p "${1:-build/containers}" && cd "${1:-build/containers}" && pwd)
@@ -38,17 +40,36 @@ make_base() {
 # As the official image: /zenohd behind /entrypoint.sh.
 make_router() {
     version=${router##*:}
-    CARGO_BUILD_JOBS=${CARGO_BUILD_JOBS:-2} cargo install zenohd --version "$version" --locked \
-        --quiet --root "$folder"
-    docker build --quiet --tag "$router" --file - "$folder/bin" >/dev/null <<END
+    program=${ZENOHD:-$(command -v zenohd || echo "$folder/bin/zenohd")}
+    if [ ! -x "$program" ] && [ -z "${ZENOHD:-}" ] && command -v cargo >/dev/null; then
+        CARGO_BUILD_JOBS=${CARGO_BUILD_JOBS:-2} cargo install zenohd --version "$version" --locked \
+            --quiet --root "$folder"
+    fi
+    if [ ! -x "$program" ]; then
+        [ -z "${ZENOHD:-}" ] || { echo "ZENOHD=$ZENOHD: no such program" >&2; exit 2; }
+        program=tests/containers/stand_in.py
+    fi
+    context=$(mktemp -d "$folder/router.XXXXXX")
+    cp "$program" "$context/zenohd"
+    case $program in *.py)
+        python3 -m pip download --quiet --no-deps --only-binary :all: --dest "$context" \
+            "eclipse-zenoh==$version"
+        ;;
+    esac
+    docker build --quiet --tag "$router" --file - "$context" >/dev/null <<END
 FROM $base
-COPY zenohd /zenohd
-RUN printf '#!/bin/sh\nexec /zenohd \$*\n' >/entrypoint.sh && chmod +x /entrypoint.sh
+COPY . /router
+RUN if ls /router/*.whl; then pip install --no-index --no-deps /router/*.whl; fi \\
+    && mv /router/zenohd / && rm -r /router \\
+    && /zenohd --version | grep -F "$version" \\
+    && printf '#!/bin/sh\nexec /zenohd \$*\n' >/entrypoint.sh && chmod +x /entrypoint.sh
 ENV RUST_LOG=info
 ENTRYPOINT ["/entrypoint.sh"]
 END
+    rm -r "$context"
 }
 
 there "$base" || make_base
 there "$router" || make_router
 docker image ls --format '{{.Repository}}:{{.Tag}} {{.Size}}' | grep -F -e "$base" -e "$router"
+docker run --rm --entrypoint /zenohd "$router" --version

@@ -26,6 +26,7 @@ def up(engine: None) -> Iterator[Stack]:
         began_s = time.monotonic()
         stack.make("up")
         print(f"\nmake up: {time.monotonic() - began_s:.0f} s")
+        print(stack.inside("router", "/zenohd", "--version").out)
         yield stack
 
 
