@@ -31,14 +31,14 @@ OFTEN = frozenset({"State", "Info", "Problem"})
 LONG_MODULES = {
     "pre_core.crossing.residuals": 767,
     "pre_core.paper.residual": 579,
-    "services.logger.writer": 511,
+    "services.logger.writer": 508,
     "services.simulation.two_sided": 861,
     "services.viewer.rerun_crossing": 490,
 }
 
 LONG_CLASSES = {
     "services.execution.cluster:DaskExecutor": 273,
-    "services.logger.writer:FileWriter": 395,
+    "services.logger.writer:FileWriter": 392,
     "services.truck.spool:Spool": 257,
 }
 
@@ -61,7 +61,7 @@ LONG_FUNCTIONS = {
     "services.simulation.two_sided:_system": 70,
     "services.simulation.two_sided:cross": 61,
     "services.simulation.wide_cases:draw_wide": 78,
-    "services.simulation.out_of_model:draw_out_of_model": 83,
+    "services.simulation.out_of_model:draw_out_of_model": 78,
     "studies.paper.scenarios:run_scenario": 71,
 }
 
@@ -285,6 +285,17 @@ def test_help_does_not_import_the_heavy_libraries() -> None:
         f"print('LOADED', sorted(set({HEAVY!r}) & sys.modules.keys()))"
     )
     assert printed(code) == "LOADED []"
+
+
+@pytest.mark.parametrize(("given", "loaded"), [(["--help"], []), (["watch", "--help"], ["watch"])])
+def test_only_the_command_that_is_parsed_is_imported(given: list[str], loaded: list[str]) -> None:
+    code = (
+        "import sys\nfrom services.cli.main import main\n"
+        f"try:\n    main({given!r})\nexcept SystemExit:\n    pass\n"
+        "within = 'services.cli.commands.'\n"
+        "print(sorted(n.removeprefix(within) for n in sys.modules if n.startswith(within)))"
+    )
+    assert printed(code) == str(loaded)
 
 
 PUT_OFF = {"pre_core": ["numpy.ctypeslib", "numpy.f2py", "numpy.testing"]}
