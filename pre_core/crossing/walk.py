@@ -20,6 +20,7 @@ from pre_core.crossing.fit import (
 )
 from pre_core.crossing.posterior import (
     PosteriorProblem,
+    has_tandem,
     layout,
 )
 from pre_core.physics.bridge import FloatArray
@@ -39,7 +40,7 @@ _REFINED_M = (0.3, 0.15)
 _NEIGHBOUR_M, _NEIGHBOURS = 0.1, 6
 """Distance and number of offsets tried on either side of an optimum with mismatch: a compliant
 bearing makes minima 0.2 m apart, which the truck of the scan does not distinguish."""
-_PATIENCE = 1.5  # strides beyond the best place
+_PATIENCE = 1.5  # strides beyond the best place, except for a tandem
 _REACH = 3.0  # of the offset's spread
 _MAX_STRIDES = 60
 """Limit of strides to either side, however uncertain the offset."""
@@ -90,7 +91,12 @@ def _local_fit(problem: PosteriorProblem, y: FloatArray, strategy: SearchStrateg
 def scan_offsets(
     problem: PosteriorProblem, y: FloatArray, strategy: SearchStrategy
 ) -> tuple[list[Placement], int]:
-    """Return candidates along the road about y (size,), best first, and the evaluations."""
+    """Return candidates along the road about y (size,), best first, and the evaluations.
+
+    The fit improves towards the right offset from afar, so that the scan ends behind the best
+    place. The axles of a tandem are too close together for that: other minima metres away fit well
+    enough to be accepted, with a wrong bridge, and the whole reach of the receiver is scanned.
+    """
     local_fit = _local_fit(problem, y, strategy)
     nothing = np.zeros(layout(problem).bridge.size)
     evaluations = y.size + 1
@@ -112,7 +118,8 @@ def scan_offsets(
         shift = sign * _STRIDE_M
         while abs(shift) <= reach:
             fit_at(shift, nothing)
-            if candidates and sign * (shift - best().shift_m) > _PATIENCE * _STRIDE_M:
+            is_behind = candidates and sign * (shift - best().shift_m) > _PATIENCE * _STRIDE_M
+            if is_behind and not has_tandem(problem):
                 break
             shift += sign * _STRIDE_M
     for stride in _REFINED_M if candidates else ():

@@ -31,10 +31,31 @@ def test_the_walk_has_a_reach_however_little_is_known(monkeypatch: pytest.Monkey
     bridge = SimpleNamespace(bridge=np.arange(3))
     monkeypatch.setattr(walk, "_local_fit", lambda problem, y, way: look)
     monkeypatch.setattr(walk, "layout", lambda problem: bridge)
+    monkeypatch.setattr(walk, "has_tandem", lambda problem: False)
     problem: Any = SimpleNamespace(receiver_rows=np.array([[1e-9]]))
     _, evaluations = walk.scan_offsets(problem, np.zeros(4), optimum._SIMPLEST)
     assert max(map(abs, seen)) < 40.0
     assert evaluations < 200
+
+
+@pytest.mark.parametrize(("is_tandem", "chosen_m"), [(False, 0.75), (True, -3.0)])
+def test_the_scan_passes_other_minima_of_a_tandem(
+    is_tandem: bool, chosen_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Objectives of a crossing whose receiver was three metres off, and of a minimum beside it."""
+
+    def look(shift: float, start: Any) -> Any:
+        here = 438.0 + 5.0 * (shift - 0.75) ** 2
+        there = 422.0 + 40.0 * (shift + 3.0) ** 2
+        return walk.Placement(min(here, there), shift, start, np.zeros(0, np.int64)), 1
+
+    bridge = SimpleNamespace(bridge=np.arange(3))
+    monkeypatch.setattr(walk, "_local_fit", lambda problem, y, way: look)
+    monkeypatch.setattr(walk, "layout", lambda problem: bridge)
+    monkeypatch.setattr(walk, "has_tandem", lambda problem: is_tandem)
+    problem: Any = SimpleNamespace(receiver_rows=np.array([[0.55]]))
+    places, _ = walk.scan_offsets(problem, np.zeros(4), optimum._SIMPLEST)
+    assert places[0].shift_m == pytest.approx(chosen_m, abs=1e-9)
 
 
 @pytest.mark.parametrize("each", [30_000, 60_000, 200_000])
