@@ -15,6 +15,7 @@ from schemas.site_numbers import Number
 
 _KEYS: Final = ("damping_ratio", "first_frequency_hz")
 _COEFFICIENTS: Final = ("rayleigh_alpha_per_s", "rayleigh_beta_s")
+_MASS_AND_SPAN: Final = ("mass_per_length_kg_per_m", "span_m")
 _SECOND: Final = 4.0
 """Second natural frequency over the first one."""
 _FAR: Final = 3.0
@@ -60,19 +61,25 @@ def with_coefficients(table: Any) -> Any:
     return rest | dict(zip(_COEFFICIENTS, rayleigh_of(*values), strict=True))
 
 
-def _check_frequency(table: dict[str, Any], first_hz: float) -> None:
-    """Raise FieldError where a single span of this EI and mass has quite another frequency."""
-    keys = ("flexural_rigidity_nm2", "mass_per_length_kg_per_m", "span_m")
-    known = [table.get(key) for key in keys]
+def implied_first_frequency_hz(table: dict[str, Any]) -> float | None:
+    """Return the first natural frequency of a single span by its EI and mass; None if unknown."""
+    known = [table.get(key) for key in ("flexural_rigidity_nm2", *_MASS_AND_SPAN)]
     if table.get("interior_supports_m") or not all(
         isinstance(value, int | float) and value > 0.0 for value in known
     ):
-        return
+        return None
     rigidity, mass, span = (float(value) for value in known if value is not None)
-    implied_hz = math.pi / (2.0 * span**2) * math.sqrt(rigidity / mass)
-    if not 1.0 / _FAR < first_hz / implied_hz < _FAR:
-        raise error_at(
-            "first_frequency_hz",
-            f"is {first_hz:g}, but {keys[0]}, {keys[1]} and span_m give {implied_hz:.3g} Hz: check "
-            f"them; {keys[0]} is {rigidity * (first_hz / implied_hz) ** 2:.3g} for {first_hz:g} Hz",
-        )
+    return math.pi / (2.0 * span**2) * math.sqrt(rigidity / mass)
+
+
+def _check_frequency(table: dict[str, Any], first_hz: float) -> None:
+    """Raise FieldError where a single span of this EI and mass has quite another frequency."""
+    implied_hz = implied_first_frequency_hz(table)
+    if implied_hz is None or 1.0 / _FAR < first_hz / implied_hz < _FAR:
+        return
+    key, rigidity = "flexural_rigidity_nm2", table["flexural_rigidity_nm2"]
+    raise error_at(
+        "first_frequency_hz",
+        f"is {first_hz:g}, but {key}, {_MASS_AND_SPAN[0]} and span_m give {implied_hz:.3g} Hz: "
+        f"check them; {key} is {rigidity * (first_hz / implied_hz) ** 2:.3g} for {first_hz:g} Hz",
+    )

@@ -11,6 +11,8 @@ from functools import partial
 from typing import Final, NamedTuple
 
 from schemas.site import Bridge, Sensor, Site, Vehicle
+from schemas.site_damping import implied_first_frequency_hz, rayleigh_of
+from schemas.toml_text import parse_toml
 
 _G_M_PER_S2: Final = 9.80665
 _FIRST_HZ: Final = (0.25, 4.0)
@@ -34,6 +36,17 @@ _TYRE_OVER_SPRING: Final = (0.9, 25.0)
 _FRONT_OVER_REAR: Final = (0.15, 2.5)
 """Stiffness of a spring over the mass on it, front over rear: rear springs carry the load."""
 _AXLE_OVER_REAR: Final = (0.3, 1.4)
+_LOADS_REVERSED: Final = (2.0, 0.4)
+"""Least factor between the loads and what springs, tyres and axles are made for, and the largest
+share of it, in logarithms, that is left with the loads exchanged."""
+_GIVEN_OVER_IMPLIED: Final = (0.6, 1.7)
+"""EI by the given first frequency over the nominal one."""
+_RATIO_AS_ALPHA: Final = (0.003, 0.1)
+"""Values of alpha in 1/s that are damping ratios of bridges."""
+_IDLE: Final = 0.25
+"""Share of beta's damping of the first mode below which alpha has no effect."""
+_ELEMENT_M: Final = 4.5
+"""Usual length of an element."""
 _TYRE_WIDTH_M: Final = (0.1, 0.6)
 _TWIN_M: Final = (0.2, 0.6)
 _TRACK_M: Final = (1.0, 2.6)
@@ -77,7 +90,8 @@ class Implied(NamedTuple):
     @property
     def advice(self) -> str:
         """Sentence that names the usual range, and what was probably meant."""
-        usual = f"usual is {self.low:.3g} to {self.high:.3g} {self.unit}".rstrip()
+        most = f" to {self.high:.3g}" if self.high < math.inf else " at least"
+        usual = f"usual is {self.low:.3g}{most} {self.unit}".rstrip()
         return f"{usual}: {self.meant}" if self.meant else f"{usual}: check units and values"
 
 
@@ -89,9 +103,10 @@ def implied_by(site: Site, vehicle: Vehicle) -> Iterator[Implied]:
         yield from of_bridge(bridge, vehicle)
 
 
-def warnings_of(site: Site) -> list[str]:
-    """Return a line for everything that is unusual."""
-    found = (one for vehicle in site.vehicles for one in implied_by(site, vehicle))
+def warnings_of(site: Site, toml_text: str = "") -> list[str]:
+    """Return a line for everything that is unusual in a site, and in its text if it is given."""
+    found = [one for vehicle in site.vehicles for one in implied_by(site, vehicle)]
+    found += of_frequencies(toml_text)
     return list(dict.fromkeys(f"{one.text}: {one.advice}" for one in found if one.is_unusual))
 
 
@@ -139,8 +154,54 @@ def of_truck(vehicle: Vehicle) -> Iterator[Implied]:
     value = _hz(springs[0] * arms[0] ** 2 + springs[1] * arms[1] ** 2, inertia)
     text = f"{vehicle.id}: body pitches at {value:.3g} Hz"
     yield _implied("pitch", text, value, _PITCH_HZ, "Hz", ())
+    yield from _odd(_loads(vehicle))
     yield from _odd(_pairs(vehicle, loads))
     yield from _odd(_tyres(vehicle))
+
+
+def of_frequencies(toml_text: str) -> Iterator[Implied]:
+    """Yield bridges of a site file whose EI contradicts the given first frequency.
+
+    Raise InputError if the text is not TOML.
+    """
+    tables = parse_toml(toml_text, "the site file").get("bridge", [])
+    for table in (tables if isinstance(tables, list) else [tables])[:_MAX_BRIDGES]:
+        given_hz, implied_hz = table.get("first_frequency_hz"), implied_first_frequency_hz(table)
+        if given_hz is None or implied_hz is None:
+            continue
+        ratio = (given_hz / implied_hz) ** 2
+        rigidity = table["flexural_rigidity_nm2"]
+        text = (
+            f"{table.get('id')}: first_frequency_hz {given_hz:g}, EI, mass and span give "
+            f"{implied_hz:.3g} Hz; EI by frequency over flexural_rigidity_nm2 {ratio:.2g}"
+        )
+        meant = f"flexural_rigidity_nm2 is {rigidity:g}: {rigidity * ratio:.3g} for {given_hz:g} Hz"
+        low, high = _GIVEN_OVER_IMPLIED
+        yield Implied("given_frequency", text, ratio, low, high, "", meant, is_certain=False)
+
+
+def _loads(vehicle: Vehicle) -> Iterator[Implied]:
+    """Yield loads that fit springs, tyres and axle masses only if front and rear are exchanged."""
+    pairs = (
+        vehicle.suspension_stiffness_n_per_m,
+        vehicle.tyre_stiffness_n_per_m,
+        vehicle.unsprung_mass_kg,
+    )
+    made_for = math.prod(rear / front for front, rear in pairs) ** (1.0 / len(pairs))
+    loads = vehicle.front_axle_to_cg_m / vehicle.cg_to_rear_axle_m
+    apart, reversed_apart = math.log(made_for / loads), math.log(made_for * loads)
+    factor, left = _LOADS_REVERSED
+    if abs(reversed_apart) > left * abs(apart):
+        return
+    text = (
+        f"{vehicle.id}: load on the rear over the front springs {loads:.2g}, springs, tyres and "
+        f"axle masses are made for {made_for:.2g}: made over given {made_for / loads:.2g}"
+    )
+    meant = (
+        f"front_axle_to_cg_m is {vehicle.front_axle_to_cg_m:g}: measured from the rear axle? then "
+        f"it is {vehicle.cg_to_rear_axle_m:.4g}"
+    )
+    yield Implied("loads_reversed", text, math.exp(apart), 1.0 / factor, factor, "", meant)
 
 
 def _pairs(vehicle: Vehicle, loads: tuple[float, float]) -> Iterator[Implied]:
@@ -225,6 +286,8 @@ def of_bridge(bridge: Bridge, vehicle: Vehicle) -> Iterator[Implied]:
     limits = (_FIRST_HZ[0] * usual, _FIRST_HZ[1] * usual)
     yield _implied("first_frequency", text, first_hz, limits, "Hz", slips)
     yield _damping(bridge, first_hz)
+    yield from _odd(_idle_alpha(bridge, first_hz))
+    yield from _odd(_elements(bridge))
     weight = vehicle.total_mass_kg * _G_M_PER_S2
     deflection = weight * span**3 / (48.0 * rigidity)
     slips = (Slip(key, rigidity, _power(deflection / span, -1.0), _RIGIDITY),)
@@ -267,6 +330,34 @@ def _damping(bridge: Bridge, first_hz: float) -> Implied:
         meant = f"{larger} is too large"
     text = f"{bridge.id}: damping ratio {value:.3g} of the first mode"
     return Implied("damping_ratio", text, value, low if value > 0.0 else 0.0, high, "", meant)
+
+
+def _idle_alpha(bridge: Bridge, first_hz: float) -> Iterator[Implied]:
+    """Yield an alpha that is a damping ratio by its size, and damps next to nothing."""
+    omega = 2.0 * math.pi * first_hz
+    alpha, beta = bridge.rayleigh_alpha_per_s, bridge.rayleigh_beta_s
+    low, high = _RATIO_AS_ALPHA
+    if not low <= alpha <= high or beta == 0.0:
+        return
+    share = alpha / (beta * omega**2)
+    text = f"{bridge.id}: alpha over beta in the damping of the first mode {share:.2g}"
+    probable = rayleigh_of(alpha, first_hz)[0]
+    meant = f"rayleigh_alpha_per_s is {alpha:g}: a damping ratio? then it is {probable:.3g} 1/s"
+    yield Implied("idle_alpha", text, share, _IDLE, math.inf, "", meant)
+
+
+def _elements(bridge: Bridge) -> Iterator[Implied]:
+    """Yield a bridge with one element for each span."""
+    spans = len(bridge.lengths_of_spans_m)
+    if bridge.elements > spans:
+        return
+    probable = sum(max(3, round(length / _ELEMENT_M)) for length in bridge.lengths_of_spans_m)
+    text = f"{bridge.id}: {bridge.elements} elements over {spans} spans: no weak place is located"
+    if spans == 1:
+        text = f"{bridge.id}: a single element: no weak place is located"
+    meant = f"elements is {bridge.elements}: {probable} are usual here"
+    value = float(bridge.elements)
+    yield Implied("elements", text, value, spans + 1.0, 3.0 * probable, "elements", meant)
 
 
 def _implied(

@@ -50,11 +50,12 @@ def _warn_of_site(path: object) -> None:
     """Log unusual values in the site file of a command; the command reports errors."""
     if not isinstance(path, Path) or not path.is_file() or path.stat().st_size > _LARGEST_CHECKED:
         return
-    from schemas.site_file import load_site
+    from schemas.site_file import parse_site, read_site_text
     from schemas.site_usual import warnings_of
 
     try:
-        found = warnings_of(load_site(path))
+        text = read_site_text(path)
+        found = warnings_of(parse_site(text, str(path)), text)
     except InputError:
         return
     for line in found:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from pre_core.diagnostics.noise_floor import NoiseSegment
 from pre_core.physics.simulate import Motion
 from schemas.site import Site, Vehicle
-from schemas.site_file import load_site, parse_site
+from schemas.site_file import parse_site, read_site_text
+from schemas.site_usual import of_frequencies
 from services.common.errors import InputError
 from services.common.progress import Offset, no_progress
 from services.finding.placed import densities_ug_per_rthz, middle_of
@@ -31,7 +32,7 @@ from services.inspection.noise import noise_of
 from services.inspection.place import bridge_findings
 from services.inspection.receiver import clocks, longest_standstill, receiver_of
 from services.inspection.recorded import InspectedRun, recorded_runs
-from services.inspection.site import findings_of_site
+from services.inspection.site import finding_of_implied, findings_of_site
 from services.recordings.recording import read_info
 
 Floats = NDArray[np.float64]
@@ -44,6 +45,13 @@ _DRIVING_M_PER_S: Final = 3.0
 _SLOW: Final = 0.9
 _DECAY_S: Final = 1.0
 """Time in s for which a body swings on its springs after a stop."""
+
+
+class SiteText(NamedTuple):
+    """The text of a site file, and its name for messages."""
+
+    toml: str
+    name: str
 
 
 class CheckReport(NamedTuple):
@@ -70,36 +78,42 @@ def inspect(
     recordings = [path for path in paths if path.suffix != ".toml"]
     if len(sites) > 1:
         raise InputError(f"{sites[1]}: a second site file, give one and recordings")
-    given = load_site(sites[0]) if sites else None
+    given = _text_of(sites[0]) if sites else None
     if given is not None:
-        yield _of_site(str(sites[0]), given)
+        yield _of_site(given)
     for path in recordings:
-        site, name = (given, str(sites[0])) if given is not None else site_beside(path)
+        beside = site_text_beside(path) if given is None else given
         if given is None:
-            yield _of_site(name, site)
+            yield _of_site(beside)
+        site, name = parse_site(*beside), beside.name
         for number, run in enumerate(recorded_runs(path, site, name, next_file())):
             yield CheckReport(
                 f"{path}, run {number + 1} of {run.vehicle}", tuple(findings_of_run(run, site))
             )
 
 
-def site_beside(path: Path) -> tuple[Site, str]:
-    """Return the site file of a recording or folder, and its name; InputError without one."""
+def site_text_beside(path: Path) -> SiteText:
+    """Return the site file of a recording or folder as text; InputError without one."""
     if path.is_dir():
         site_path = path / "site.toml"
         if not site_path.is_file():
             raise InputError(f"{path}: holds no site.toml, give a site file before it")
-        return load_site(site_path), str(site_path)
+        return _text_of(site_path)
     text = read_info(path, lambda message: None).site_toml
     if text is None:
         raise InputError(f"{path}: holds no site file, give one before it")
-    name = f"{path}: site.toml"
-    return parse_site(text, name), name
+    return SiteText(text, f"{path}: site.toml")
 
 
-def _of_site(name: str, site: Site) -> CheckReport:
+def _text_of(path: Path) -> SiteText:
+    return SiteText(read_site_text(path), str(path))
+
+
+def _of_site(text: SiteText) -> CheckReport:
+    site = parse_site(*text)
     found = [finding for vehicle in site.vehicles for finding in findings_of_site(site, vehicle)]
-    return CheckReport(name, tuple(dict.fromkeys(found)), is_run=False)
+    found += map(finding_of_implied, of_frequencies(text.toml))
+    return CheckReport(text.name, tuple(dict.fromkeys(found)), is_run=False)
 
 
 def findings_of_run(run: InspectedRun, site: Site) -> Iterator[CheckFinding]:

@@ -164,3 +164,71 @@ def test_survey_speed_in_km_per_h_is_named() -> None:
     text = TEXT.replace("[sensor]", "survey_speed_m_per_s = 50.0\n\n[sensor]", 1)
     (line,) = warnings_of(parse_site(text, "site.toml"))
     assert "survey_speed_m_per_s is 50: in km/h? then it is 13.8889" in line
+
+
+def by_frequency(first_hz: float, rigidity: float) -> str:
+    """The example with damping ratio and first frequency in place of the coefficients."""
+    text = with_value("bridge", "flexural_rigidity_nm2", repr(rigidity))
+    lines = [line for line in text.split("\n") if not line.startswith("rayleigh_")]
+    where = lines.index("[bridge]") + 1
+    return "\n".join(
+        [
+            *lines[:where],
+            "damping_ratio = 0.02",
+            f"first_frequency_hz = {first_hz}",
+            *lines[where:],
+        ]
+    )
+
+
+@pytest.mark.parametrize(("factor", "names_it"), [(1.0, False), (0.5, True), (2.0, True)])
+def test_rigidity_that_contradicts_the_first_frequency_is_named(
+    factor: float, names_it: bool
+) -> None:
+    text = by_frequency(3.29, factor * 1.56e10)
+    lines = warnings_of(parse_site(text, "site.toml"), text)
+    if not names_it:
+        assert lines == []
+        return
+    (line,) = lines
+    assert "flexural_rigidity_nm2" in line
+    assert "1.56e+10 for 3.29 Hz" in line
+
+
+def test_damping_ratio_for_alpha_is_named_with_the_probable_value() -> None:
+    text = with_value("bridge", "rayleigh_alpha_per_s", "0.02")
+    (line,) = warnings_of(parse_site(text, "site.toml"))
+    first_hz = next(
+        one.value for one in implied_by(SITE, SITE.vehicles[0]) if one.name == "first_frequency"
+    )
+    probable = 2 * 0.02 * 2 * math.pi * first_hz * 4 / 5
+    assert f"a damping ratio? then it is {probable:.3g} 1/s" in line
+
+
+@pytest.mark.parametrize(("cg_m", "names_it"), [(2.7, False), (1.8, True)])
+def test_centre_of_gravity_measured_from_the_rear_axle_is_named(
+    cg_m: float, names_it: bool
+) -> None:
+    truck = SITE.vehicles[0].model_copy(
+        update={
+            "total_mass_kg": 16000.0,
+            "wheelbase_m": 4.5,
+            "front_axle_to_cg_m": cg_m,
+            "suspension_stiffness_n_per_m": (5e5, 1.1e6),
+            "suspension_damping_ns_per_m": (2e4, 4e4),
+            "unsprung_mass_kg": (700.0, 1100.0),
+            "tyre_stiffness_n_per_m": (2e6, 4e6),
+        }
+    )
+    lines = warnings_of(SITE.model_copy(update={"vehicles": (truck,)}))
+    if not names_it:
+        assert lines == []
+        return
+    (line,) = lines
+    assert "measured from the rear axle? then it is 2.7" in line
+
+
+def test_single_element_is_named_with_a_usual_number() -> None:
+    text = with_value("bridge", "elements", "1")
+    (line,) = warnings_of(parse_site(text, "site.toml"))
+    assert "elements is 1: 7 are usual here" in line
