@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn
 
+from services.cli.config_file import CONFIG, with_config
 from services.common.errors import InputError
 from services.common.kinds import Kind
 from services.common.options import OutputFile, folder_here
@@ -62,6 +63,8 @@ class Parser(argparse.ArgumentParser):
         given = list(sys.argv[1:] if args is None else args)
         ends = given.index("--") if "--" in given else len(given)
         current = [self._current(one) for one in given[:ends]]
+        if any(CONFIG in action.option_strings for action in self._actions):
+            current = with_config(self, current)
         return super().parse_known_args([*current, *given[ends:]], namespace)
 
     def _current(self, argument: str) -> str:

@@ -102,6 +102,12 @@ def speed_option(default: float, *, zero: str = "", group: str = "") -> Any:
     )
 
 
+def config_option() -> Any:
+    """Return `--config`: a file of options, which the command line overrides."""
+    text = "options by name, such as min_free = 800; the command line overrides them"
+    return file_option(text, "CONFIG.toml")
+
+
 def file_option(text: str, metavar: str, *, group: str = "") -> Any:
     """Return an option that names a file to read."""
     return opt(text, Path, group=group, metavar=metavar)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from services.common.endpoints import DEFAULT_ENDPOINT, default_endpoint
 from services.common.options import (
+    config_option,
     flag,
     folder_option,
     id_option,
@@ -26,6 +27,7 @@ _ROOM = "files and disk space"
 class LoggerSettings:
     """Settings of one run of the logger."""
 
+    config: Path | None = config_option()
     listen: str | None = opt(f"address to listen on (default: {DEFAULT_ENDPOINT})")
     tls: Path | None = tls_option()
     insecure: bool = flag(

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from services.common.endpoints import default_endpoint
 from services.common.options import (
+    config_option,
     endpoint_option,
     flag,
     folder_option,
@@ -28,6 +29,7 @@ _VALIDATION = "validation"
 class WorkerSettings:
     """Settings of one run of the worker."""
 
+    config: Path | None = config_option()
     endpoint: str | None = endpoint_option()
     tls: Path | None = tls_option()
     realm: str = realm_option()

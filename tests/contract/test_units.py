@@ -57,21 +57,23 @@ def test_logger_and_worker_have_units() -> None:
 
 
 @pytest.mark.parametrize("name", UNITS)
-def test_unit_starts_its_command(name: str) -> None:
+def test_unit_starts_its_command(name: str, tmp_path: Path) -> None:
     service = unit(name)["Service"]
     program, *arguments = shlex.split(service["ExecStart"])
     assert program == PROGRAM
-    assert arguments.pop() == "$OPTIONS"
-    text = UNITS[name].read_text()
-    more = re.search(r"^#     OPTIONS=(.*)$", text, re.MULTILINE)
-    assert more is not None
-    for given in (arguments, [*arguments, *shlex.split(more[1])]):
-        options = cli._parser().parse_args(given)
+    assert arguments[-2:] == ["--config", f"/etc/driveby/{name}.toml"]
+    example = (ROOT / "deploy" / f"{name}.toml").read_text()
+    complete = re.sub(r"^# (?=[a-z_]+ = )", "", example, flags=re.MULTILINE)
+    assert complete != example
+    for number, text in enumerate((example, complete)):
+        config = tmp_path / f"{number}.toml"
+        config.write_text(text)
+        options = cli._parser().parse_args([*arguments[:-1], str(config)])
         assert name_of(options) == name
         assert name in cli._SERVICES
         assert options.folder == Path("recordings")
         assert options.site == Path("/etc/driveby/site.toml")
-    assert service["EnvironmentFile"] == f"-/etc/driveby/{name}.env"
+        assert (options.tls is not None) == (text == complete)
     assert service["WorkingDirectory"] == f"/var/lib/{service['StateDirectory']}"
     assert service["RestartPreventExitStatus"] == str(cli.EXIT_BAD_INPUT)
 

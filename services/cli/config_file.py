@@ -1,0 +1,94 @@
+"""Options of a command from a TOML file: keys are the options' names with `_` for `-`.
+
+The command line overrides the file: a key is left out where its option, or an alternative to it,
+is given as an argument.
+"""
+
+import argparse
+import difflib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from schemas.toml_text import parse_toml, read_toml_text
+from services.common.errors import InputError
+
+CONFIG: Final = "--config"
+
+
+def with_config(parser: argparse.ArgumentParser, given: Sequence[str]) -> list[str]:
+    """Return the arguments with those of the configuration file before them.
+
+    Raise InputError, in one line, for an unreadable file, an unknown key or an impossible value.
+    """
+    path = _config_path(given)
+    if path is None:
+        return list(given)
+    actions = {_key(action): action for action in parser._actions if _key(action)}
+    overridden = _overridden(parser, given)
+    arguments: list[str] = []
+    for key, value in parse_toml(read_toml_text(path, "a configuration file"), str(path)).items():
+        if key not in actions:
+            close = difflib.get_close_matches(key.replace("-", "_"), actions, n=1, cutoff=0.0)
+            raise InputError(f"{path}: {key}: is unknown, did you mean {close[0]}?")
+        of_key = list(_arguments_of(actions[key], f"{path}: {key}", value))
+        if actions[key] not in overridden:
+            arguments += of_key
+    return [*arguments, *given]
+
+
+def _config_path(given: Sequence[str]) -> Path | None:
+    """Return the last configuration file among arguments."""
+    path = None
+    for argument, following in zip(given, [*given[1:], ""], strict=True):
+        name, equals, value = argument.partition("=")
+        if name == CONFIG:
+            path = Path(value if equals else following)
+    return path
+
+
+def _key(action: argparse.Action) -> str:
+    """Return the key of an option; empty for what a file cannot set."""
+    names = [name for name in action.option_strings if name.startswith("--")]
+    if not names or names[0] in (CONFIG, "--help"):
+        return ""
+    return names[0].removeprefix("--").replace("-", "_")
+
+
+def _overridden(parser: argparse.ArgumentParser, given: Sequence[str]) -> set[argparse.Action]:
+    """Return the options among the arguments, and the alternatives to them."""
+    names = {argument.partition("=")[0] for argument in given}
+    found = {action for action in parser._actions if names & set(action.option_strings)}
+    for group in parser._mutually_exclusive_groups:
+        if found & set(group._group_actions):
+            found |= set(group._group_actions)
+    return found
+
+
+def _arguments_of(action: argparse.Action, where: str, value: object) -> Iterator[str]:
+    """Yield the arguments that a key stands for."""
+    option = action.option_strings[-1]
+    if action.nargs == 0:
+        if not isinstance(value, bool):
+            raise InputError(f"{where}: is {value!r}, it must be true or false")
+        if value:
+            yield option
+        return
+    if isinstance(value, list) and not isinstance(action, argparse._AppendAction):
+        raise InputError(f"{where}: is {value!r}, it must be one value")
+    for one in value if isinstance(value, list) else [value]:
+        if isinstance(one, bool) or not isinstance(one, str | int | float):
+            raise InputError(f"{where}: is {one!r}, it must be a text or a number")
+        yield f"{option}={_checked(action, where, str(one))}"
+
+
+def _checked(action: argparse.Action, where: str, text: str) -> str:
+    """Return the text if the option accepts it."""
+    if callable(action.type):
+        try:
+            action.type(text)
+        except (argparse.ArgumentTypeError, ValueError) as error:
+            raise InputError(f"{where}: {error}") from None
+    if action.choices is not None and text not in action.choices:
+        raise InputError(f"{where}: is {text!r}, it must be one of {', '.join(action.choices)}")
+    return text
