@@ -2,6 +2,8 @@
 
 from typing import Final
 
+from schemas.site import Vehicle
+
 TEMPLATE: Final = """\
 # A site file: truck, bridge and sensors as they are known before the drive. All SI.
 # Replace every nan. What begins with # may stay so: it shows its default, or may be unknown.
@@ -100,3 +102,28 @@ noise_density_ug_per_rthz = nan       # of the data sheet; driveby check compare
 # latency_s = 0.0
 # latency_spread_s = 0.1
 """
+
+_USUAL: Final = (
+    "suspension_damping_ns_per_m",
+    "suspension_stiffness_n_per_m",
+    "unsprung_mass_kg",
+    "tyre_stiffness_n_per_m",
+    "twin_tyre_distance_m",
+    "tyre_width_m",
+    "track_m",
+)
+"""Keys that are alike in trucks of one kind; masses and lengths have to be measured."""
+_USUAL_SPREAD: Final = 0.3
+
+
+def template_of(truck: Vehicle) -> str:
+    """Return the template with springs, dampers, axles and tyres of a usual truck."""
+    lines = []
+    for line in TEMPLATE.split("\n"):
+        key, _, _ = line.removeprefix("# ").partition(" = ")
+        if key in _USUAL:
+            line = f"{f'{key} = {list(getattr(truck, key))}':<60}# usual, not measured"
+        elif key.removesuffix("_spread") in _USUAL:
+            line = f"{key} = {_USUAL_SPREAD}"
+        lines.append(line)
+    return "\n".join(lines)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from services.cli.parser import Subcommand
-from services.common.options import flag, output_option, positional
+from services.common.options import flag, opt, output_option, positional
 
 if TYPE_CHECKING:
     from services.inspection.inspect import CheckReport
@@ -27,6 +27,11 @@ class CheckOptions:
     template: Path | None = output_option(
         "write a commented site file to start from, and check nothing", "NEW.toml"
     )
+    truck: str | None = opt(
+        "with --template: fill in springs, dampers, axle masses and tyres of a usual lorry with "
+        "two axles, known to 30 %",
+        choices=("lorry-single", "lorry-twin"),
+    )
     json: bool = flag("print all findings as JSON")
 
 
@@ -37,16 +42,21 @@ def _check(options: CheckOptions) -> int:
     from services.inspection.inspect import inspect
 
     if options.template is not None:
-        from services.inspection.template import TEMPLATE
+        from services.inspection.template import TEMPLATE, template_of
+        from services.simulation.usual_trucks import usual_lorry
 
         if options.paths:
             raise InputError(f"--template: checks nothing, give {options.paths[0]} without it")
         if options.template.exists():
             raise InputError(f"{options.template}: exists, give the name of a new site file")
         check_writable(options.template)
-        write_atomically(options.template, TEMPLATE)
+        kind = options.truck
+        text = template_of(usual_lorry(kind.removeprefix("lorry-"))) if kind else TEMPLATE
+        write_atomically(options.template, text)
         print(f"{options.template}: fill it in, then driveby check {options.template}")
         return 0
+    if options.truck is not None:
+        raise InputError("--truck: fills in a new site file, give --template NEW.toml")
     if not options.paths:
         raise InputError("a site file or recordings are expected, or --template NEW.toml")
     for path in options.paths:

@@ -14,6 +14,7 @@ from schemas.site_damping import rayleigh_of
 from schemas.site_file import faults_of_site, load_site, parse_site
 from services.cli import main as cli
 from services.inspection.template import TEMPLATE
+from services.simulation.usual_trucks import usual_lorry
 
 MODELS: dict[str, type[BaseModel]] = {
     "vehicle": Vehicle, "bridge": Bridge, "sensor": Sensor, "receiver": Receiver,
@@ -56,6 +57,30 @@ def test_filled_in_it_is_the_site_that_was_meant(project: Path) -> None:
     assert tuple(coefficients(bridge).values()) == rayleigh_of(0.02, 3.3)
     assert found.bridges[0].model_copy(update=coefficients(meant.bridges[0])) == meant.bridges[0]
     assert found.model_copy(update={"bridges": meant.bridges}) == meant
+
+
+@pytest.mark.parametrize("tyres", ["single", "twin"])
+def test_usual_truck_leaves_only_what_has_to_be_measured(tmp_path: Path, tyres: str) -> None:
+    path = tmp_path / "new.toml"
+    assert cli.main(["check", "--template", str(path), "--truck", f"lorry-{tyres}"]) == 0
+    text = path.read_text()
+    vehicle = text[: text.index("[bridge]")]
+    assert [key for key, _ in NEEDED.findall(vehicle)] == [
+        "total_mass_kg",
+        "wheelbase_m",
+        "front_axle_to_cg_m",
+        "gps_antenna_to_front_axle_m",
+    ]
+    tables = tomllib.loads(vehicle)["vehicle"]
+    truck = usual_lorry(tyres)
+    for key in ("suspension_stiffness_n_per_m", "unsprung_mass_kg", "track_m"):
+        assert tuple(tables[key]) == getattr(truck, key)
+    assert tables["tyre_stiffness_n_per_m_spread"] == 0.3
+    assert (tables["twin_tyre_distance_m"][1] > 0.0) == (tyres == "twin")
+
+
+def test_usual_truck_without_a_template_is_refused() -> None:
+    assert cli.main(["check", "site.toml", "--truck", "lorry-twin"]) == cli.EXIT_BAD_INPUT
 
 
 def coefficients(bridge: Bridge) -> dict[str, float]:
