@@ -15,8 +15,12 @@ from typing import TYPE_CHECKING
 from services.common.extras import check_extras
 
 if TYPE_CHECKING:
+    from driveby.diagnostic_plots import plot_chains as plot_chains
+    from driveby.diagnostic_plots import plot_posterior as plot_posterior
+    from driveby.diagnostic_plots import plot_residual as plot_residual
     from driveby.plotting import plot as plot
     from driveby.reports import report as report
+    from driveby.simulations import simulate_recording as simulate_recording
     from driveby.surveys import SurveyPlan as SurveyPlan
     from driveby.surveys import survey as survey
     from schemas.signals import CHANNELS as CHANNELS
@@ -52,9 +56,13 @@ __all__ = [
     "identify",
     "load_site",
     "plot",
+    "plot_chains",
+    "plot_posterior",
+    "plot_residual",
     "read",
     "report",
     "simulate",
+    "simulate_recording",
     "survey",
     "with_values",
 ]
@@ -74,9 +82,13 @@ _PLACES = {
     "identify": "services.notebook.identify",
     "load_site": "schemas.site_file",
     "plot": "driveby.plotting",
+    "plot_chains": "driveby.diagnostic_plots",
+    "plot_posterior": "driveby.diagnostic_plots",
+    "plot_residual": "driveby.diagnostic_plots",
     "read": "services.notebook.read",
     "report": "driveby.reports",
     "simulate": "services.notebook.simulate",
+    "simulate_recording": "driveby.simulations",
     "survey": "driveby.surveys",
     "with_values": "schemas.site_file",
 }
@@ -89,8 +101,12 @@ _NEEDS = {
     "fuse": ("identify",),
     "identify": ("identify",),
     "plot": ("identify", "view"),
+    "plot_chains": ("identify", "view"),
+    "plot_posterior": ("identify", "view"),
+    "plot_residual": ("identify", "view"),
     "report": ("identify", "view"),
     "simulate": ("identify",),
+    "simulate_recording": ("identify",),
     "survey": ("identify",),
 }
 """Extras, by the names that need them."""

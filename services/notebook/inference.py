@@ -35,6 +35,11 @@ def prior_of(crossings: Sequence[CrossingResult]) -> "xr.Dataset":
     return posterior(drawn)
 
 
+def prior_draws(prior: Prior) -> Floats:
+    """Return 2000 draws (n,) of a prior."""
+    return _drawn(prior, np.random.default_rng(_SEED))
+
+
 def _drawn(prior: Prior, rng: np.random.Generator) -> Floats:
     """Return draws (n,) of a prior."""
     if prior.distribution == "uniform":

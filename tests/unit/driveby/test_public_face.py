@@ -601,3 +601,43 @@ def test_report_is_that_of_the_command_line(
     assert again.read_text() == theirs.read_text()
     with pytest.raises(driveby.InputError, match="the name of an HTML file"):
         driveby.report(found, output=tmp_path / "mine.pdf")
+
+
+def test_simulate_recording_takes_the_options_of_the_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given = []
+
+    def handler(options: Any) -> int:
+        given.append(options)
+        return 0
+
+    monkeypatch.setattr("services.cli.simulate._simulate", handler)
+    path = driveby.simulate_recording(
+        "drive.mcap", site=paper_site(), ei=[1, 1, 0.5], speed=(9, 11), runs=3, road_surface=True
+    )
+    assert path == Path("drive.mcap")
+    (options,) = given
+    assert (options.ei, options.speed) == ((1.0, 1.0, 0.5), (9.0, 11.0))
+    assert (options.runs, options.road_surface, options.gps_noise) == (3, True, False)
+    assert options.output == path
+    with pytest.raises(driveby.InputError, match="rnus: is unknown, did you mean runs"):
+        driveby.simulate_recording("drive.mcap", scenario=6, rnus=3)
+    with pytest.raises(driveby.InputError, match="--runs"):
+        driveby.simulate_recording("drive.mcap", scenario=6, runs=0)
+    assert len(given) == 1
+
+
+def test_diagnostic_plots_have_a_panel_for_each_parameter(found: driveby.Identification) -> None:
+    (solution,) = found.solutions
+    (residual,) = driveby.plot_residual(solution).axes
+    road = solution.crossing.road
+    assert road is not None
+    drawn = residual.lines[0].get_ydata()
+    assert drawn == pytest.approx(1e3 * (np.array(road.front_m) - np.array(road.rear_m)))
+    assert len(driveby.plot_posterior(solution).axes) == solution.bridge.elements
+    chains = driveby.plot_chains(solution, ["rhoA", "EI_4"]).axes
+    assert [axes.get_title(loc="left") for axes in chains] == ["rhoA", "EI_4"]
+    assert len(chains[0].lines) == len(solution.draws["rhoA"])
+    with pytest.raises(driveby.InputError, match="EI_9: is unknown"):
+        driveby.plot_posterior(solution, ["EI_9"])

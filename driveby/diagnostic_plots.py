@@ -1,0 +1,116 @@
+"""Pictures of one crossing for researchers: residual road, posterior and chains."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from services.common.errors import InputError
+from services.notebook.inference import prior_draws
+from services.notebook.solution import Solution
+from services.viewer.drawing import STYLE
+
+_COLUMNS: Final = 4
+_BINS: Final = 60
+_SHOWN: Final = 6.0
+"""Posterior standard deviations on either side of the mean that are drawn."""
+_CUT: Final = (0.5, 99.5)
+"""Percentiles of the prior draws that are drawn."""
+
+
+def plot_residual(solution: Solution) -> Figure:
+    """Draw the profile under the front wheel minus that under the rear wheel, over the chainage.
+
+    Long waves, the drift of twice integrated accelerations, have little weight in the fit. Raise
+    InputError for a crossing without a road profile.
+    """
+    road = solution.crossing.road
+    if road is None:
+        raise InputError(f"{solution.crossing.crossing_id}: has no road profile")
+    x_m = np.asarray(road.x_m)
+    difference_mm = 1e3 * (np.asarray(road.front_m) - np.asarray(road.rear_m))
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(8.0, 3.0), layout="constrained")
+        axes = figure.add_subplot()
+        axes.axvspan(0.0, solution.bridge.span_m, alpha=0.1, color="0.5", lw=0.0)
+        axes.plot(x_m, difference_mm, lw=0.8)
+        rms_mm = float(np.sqrt(np.mean(difference_mm**2)))
+        axes.set_title(f"profile mismatch, front minus rear: {rms_mm:.3g} mm RMS; bridge shaded")
+        axes.set_xlabel("chainage (m)")
+        axes.set_ylabel("mm")
+    return figure
+
+
+def plot_posterior(solution: Solution, names: Sequence[str] | None = None) -> Figure:
+    """Draw prior and posterior density of parameters, by default of all EI, with 95 % intervals.
+
+    Raise InputError for an unknown name or a crossing without draws.
+    """
+    chosen = _chosen(solution, names)
+    with matplotlib.rc_context(STYLE):
+        figure, panels = _panels(len(chosen), 2.0)
+        for axes, name in zip(panels, chosen, strict=True):
+            found = solution.value[name]
+            draws = solution.draws[name].ravel()
+            if found.prior is not None:
+                prior = prior_draws(found.prior)
+                limits = np.percentile(prior, _CUT)
+                axes.hist(
+                    prior,
+                    bins=_BINS,
+                    range=(limits[0], limits[1]),
+                    density=True,
+                    color="0.8",
+                    label="prior",
+                )
+            axes.hist(draws, bins=_BINS, density=True, label="posterior")
+            for limit in (found.q025, found.q975):
+                axes.axvline(limit, color="0.3", lw=0.8, ls="--")
+            axes.set_xlim(found.mean - _SHOWN * found.std, found.mean + _SHOWN * found.std)
+            axes.set_title(name)
+            axes.set_xlabel(found.unit)
+            axes.set_yticks([])
+        panels[0].legend(fontsize="small")
+    return figure
+
+
+def plot_chains(solution: Solution, names: Sequence[str] | None = None) -> Figure:
+    """Draw the draws of parameters in their order, by default of all EI, a line for each chain.
+
+    Raise InputError for an unknown name or a crossing without draws.
+    """
+    chosen = _chosen(solution, names)
+    with matplotlib.rc_context(STYLE):
+        figure, panels = _panels(len(chosen), 1.8)
+        for axes, name in zip(panels, chosen, strict=True):
+            for chain in solution.draws[name]:
+                axes.plot(chain, lw=0.4, alpha=0.7)
+            axes.set_title(name)
+            axes.set_xlabel("draw")
+            axes.set_ylabel(solution.value[name].unit)
+    return figure
+
+
+def _chosen(solution: Solution, names: Sequence[str] | None) -> list[str]:
+    known = [name for name in solution.draws if name in solution.value]
+    if not known:
+        raise InputError(
+            f"{solution.crossing.crossing_id}: has no draws; method pre has, with draws=True"
+        )
+    chosen = [name for name in known if name.startswith("EI_")] if names is None else list(names)
+    for name in chosen:
+        if name not in known:
+            raise InputError(f"{name}: is unknown, it must be one of {', '.join(known)}")
+    if not chosen:
+        raise InputError("no names given, a parameter such as EI_1 is expected")
+    return chosen
+
+
+def _panels(count: int, height_in: float) -> tuple[Figure, list[Axes]]:
+    columns = min(count, _COLUMNS)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(2.6 * columns, height_in * rows + 0.2), layout="constrained")
+    return figure, [figure.add_subplot(rows, columns, k + 1) for k in range(count)]
