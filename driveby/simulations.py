@@ -8,8 +8,8 @@ from pathlib import Path
 
 from schemas.site import Site
 from schemas.site_file import site_toml
+from services.cli.commands.simulate import SIMULATE
 from services.cli.parsing import Parser
-from services.cli.simulate import add_simulate
 from services.common.errors import InputError
 from services.execution.blas import one_blas_thread
 from services.notebook.read import Name
@@ -55,7 +55,7 @@ def _arguments(options: dict[str, object]) -> Iterator[str]:
 
 def _parsed(*arguments: str) -> argparse.Namespace:
     parser = Parser(prog="driveby", allow_abbrev=False)
-    add_simulate(parser.add_subparsers(parser_class=Parser))
+    SIMULATE.add(parser.add_subparsers(parser_class=Parser))
     return parser.parse_args(["simulate", *arguments])
 
 

@@ -608,11 +608,11 @@ def test_simulate_recording_takes_the_options_of_the_command(
 ) -> None:
     given = []
 
-    def handler(options: Any) -> int:
-        given.append(options)
+    def command(asked: Any, console: Any) -> int:
+        given.append(asked)
         return 0
 
-    monkeypatch.setattr("services.cli.simulate._simulate", handler)
+    monkeypatch.setattr("services.simulation.command.simulate_command", command)
     path = driveby.simulate_recording(
         "drive.mcap", site=paper_site(), ei=[1, 1, 0.5], speed=(9, 11), runs=3, road_surface=True
     )
