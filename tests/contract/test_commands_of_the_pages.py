@@ -46,6 +46,8 @@ NOT_RUN = {
         "tests/unit/cli/test_cluster.py has a store"
     ),
     'pip install "driveby[history,s3]"': NETWORK,
+    'pip install --upgrade "driveby[all]"': NETWORK,
+    "pip uninstall driveby": "removes what this test runs in",
     "python -m tests.benchmarks.fleet --out /tmp/fleet": LONG,
     "python -m tests.benchmarks.alarms": LONG,
     "make year": LONG,
@@ -108,7 +110,6 @@ NOT_RUN = {
     "make down": ENGINE,
     "make containers": ITSELF,
     "make docs": "needs a network the first time; tests/contract/test_site.py builds the site",
-    'pip install ".[identify,view,notebook]"': NETWORK,
     'pip install "driveby[identify,view,notebook]"': NETWORK,
     'pip install "driveby[notebook]"': NETWORK,
     "pip install driveby": NETWORK,
