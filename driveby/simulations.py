@@ -8,7 +8,7 @@ from pathlib import Path
 
 from schemas.site import Site
 from schemas.site_file import site_toml
-from services.cli.commands.simulate import SIMULATE
+from services.cli.parser import add_command
 from services.cli.parsing import Parser
 from services.common.errors import InputError
 from services.execution.blas import one_blas_thread
@@ -55,7 +55,7 @@ def _arguments(options: dict[str, object]) -> Iterator[str]:
 
 def _parsed(*arguments: str) -> argparse.Namespace:
     parser = Parser(prog="driveby", allow_abbrev=False)
-    SIMULATE.add(parser.add_subparsers(parser_class=Parser))
+    add_command(parser.add_subparsers(parser_class=Parser), "simulate")
     return parser.parse_args(["simulate", *arguments])
 
 
