@@ -40,7 +40,7 @@ def with_config(parser: argparse.ArgumentParser, given: Sequence[str]) -> list[s
 def _config_path(given: Sequence[str]) -> Path | None:
     """Return the last configuration file among arguments."""
     path = None
-    for argument, following in zip(given, [*given[1:], ""], strict=True):
+    for argument, following in zip(given, [*given, ""][1:], strict=True):
         name, equals, value = argument.partition("=")
         if name == CONFIG:
             path = Path(value if equals else following)

@@ -29,7 +29,7 @@ class CheckOptions:
     )
     truck: str | None = opt(
         "with --template: fill in springs, dampers, axle masses and tyres of a usual lorry with "
-        "two axles, known to 30 %",
+        "two axles, known to 30 %%",
         choices=("lorry-single", "lorry-twin"),
     )
     json: bool = flag("print all findings as JSON")

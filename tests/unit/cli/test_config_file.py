@@ -74,3 +74,7 @@ def test_fault_of_the_file_is_one_line_with_its_key(
 def test_missing_file_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["worker", "--config", str(tmp_path / "no.toml")]) == cli.EXIT_BAD_INPUT
     assert "no such file" in capsys.readouterr().err
+
+
+def test_no_argument_names_no_file() -> None:
+    assert parsed("logger").realm != ["sim-a", "sim-b"]

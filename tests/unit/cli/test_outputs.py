@@ -50,7 +50,7 @@ FOLDERS = {
 }  # fmt: skip
 READS = {
     "--site", "--baseline", "--tls", "--validations", "--history", "--truth", "--temperature",
-    "--recordings", "--folder", "--spool", "--map",
+    "--recordings", "--folder", "--spool", "--map", "--config",
 }  # fmt: skip
 """Options with a path that no file is put to by its own name."""
 
