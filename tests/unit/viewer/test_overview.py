@@ -77,7 +77,7 @@ def test_reasons_of_a_bridge_name_their_crossing(
     view = view_of_bridge(site.bridges[0], found, None)
     rerun_file._log_overview(Recording(), view)  # type: ignore[arg-type]
     (text,) = texts.values()
-    assert "- 2026-09-21 14:14 → bridge-1, rejected, not used: The truck was too slow" in text
+    assert "- 2026-09-21 14:14 → bridge-1, rejected, not used: The truck was so slow" in text
 
 
 def test_the_overview_has_the_picture_of_the_bridge_and_the_finding(

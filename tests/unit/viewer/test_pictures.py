@@ -113,7 +113,7 @@ def test_a_bridge_that_nothing_is_known_of_says_why(site: Site) -> None:
     text = written(figure)
     assert bars(figure) == []
     assert "No finding: none of 3 crossings could be used." in text
-    assert "• The truck was too slow" in text
+    assert "• The truck was so slow" in text
     assert_words_apart(figure)
 
 
