@@ -42,6 +42,12 @@ _CLEAR_FRICTION_WEIGHT = 0.05
 _NO_FIT_CHI2 = 10.0
 """Limit of chi2 at five times the noise: right starts of 90 drawn crossings had 1.6 at most, wrong
 ones 10 to 70."""
+_FAR_OFF_CHI2 = 200.0
+"""Value of chi2 at five times the noise, with reduced suspension weight, above which the fit is not
+continued: sound crossings had 13 at most from an offset, one with a second vehicle up to 1,900."""
+HOPELESS_CHI2 = 25.0
+"""Value of chi2 after a fit above which it is not repeated with another noise or free ends, nor, at
+a second offset, from a third one."""
 _MAX_ROUNDS, _EARLY_ROUNDS = 6, 2
 """Limit of alternating fits and noise estimates, finally and in earlier stages."""
 _MAX_STEPS, _EARLY_STEPS = 25, 8
@@ -243,7 +249,9 @@ def fit_all(
     y = _not_negative(problem, y)
     if not (problem.force.any() or is_accepted(problem, chi2_per_dof(problem, y))):
         problem = _at_misfit(problem, y)
-    if problem.force.any():
+    if problem.force.any() and chi2_per_dof(problem, y) > _FAR_OFF_CHI2:
+        ending = Termination.STEPS_EXHAUSTED
+    elif problem.force.any():
         problem, y, ending, used = _fit_in_noise_rounds(problem, y, free, _MAX_ROUNDS, _at_misfit)
         evaluations += used
     state = levenberg_marquardt.initial_state(lambda at: all_rows(problem, at), y)
@@ -287,7 +295,7 @@ def _fit_in_noise_rounds(
             problem, y, directions, temperature, steps, enough, is_free=is_free
         )
         evaluations += used
-        if not problem.force.any():
+        if not problem.force.any() or chi2_per_dof(problem, y) > HOPELESS_CHI2:
             break
         before, problem = problem, refresh_noise(problem, y)
         if abs(before.force.sum() - problem.force.sum()) <= _SAME_LEVEL * before.force.sum():

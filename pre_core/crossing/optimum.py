@@ -15,6 +15,7 @@ If the result is a misfit because of hum, the search is repeated without the hum
 import numpy as np
 
 from pre_core.crossing.fit import (
+    HOPELESS_CHI2,
     AbandonReason,
     Optimum,
     SearchStrategy,
@@ -65,7 +66,7 @@ _MAX_MOVES = 4
 """Limit of moves from an optimum to a neighbouring one."""
 _SAME_MINIMUM_M = 0.2
 """Distance within which offsets lead to one minimum."""
-_HOPELESS_CHI2 = (1000.0, 25.0)
+_HOPELESS_CHI2 = (1000.0, HOPELESS_CHI2)
 """Values of chi2 above which no other offset is tried, after one candidate and after more. Of 70
 drawn fault-free crossings the first candidate was right in all; another one never reduced such a
 chi2 to a usable one."""
@@ -292,7 +293,7 @@ def _with_free_ends(found: Optimum, strategy: SearchStrategy) -> tuple[Optimum, 
     """
     where, y = layout(found.problem), found.state.y
     ends = np.intersect1d(where.half_normal, where.bridge)
-    if not np.any(y[ends] > _CLEAR_RESTRAINT):
+    if not np.any(y[ends] > _CLEAR_RESTRAINT) or found.chi2_per_dof > HOPELESS_CHI2:
         return found, 0
     start = y.copy()
     start[where.bridge] = 0.0

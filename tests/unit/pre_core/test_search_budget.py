@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pre_core.crossing import optimum, walk
+from pre_core.crossing import fit, optimum, walk
 from pre_core.crossing.fit import Optimum
 from pre_core.physics.tandem import NO_LEAD
 from pre_core.search.loop import Termination
@@ -87,3 +87,40 @@ def test_a_fit_that_took_long_is_a_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(optimum, "is_accepted", lambda problem, chi2: chi2 < 1.5)
     inputs: Any = None
     assert optimum.find_optimum(inputs).ending is Termination.CONVERGED
+
+
+@pytest.mark.parametrize(
+    ("chi2", "rounds"),
+    [
+        ((26.0, 1.0), 1),
+        ((24.0, 26.0, 1.0), 2),
+        ((24.0, 24.0, 15.0, 10.0, 5.0, 2.0), 6),
+        ((1.9, 1.9, 1.9, 1.9, 1.9, 1.9), 6),
+    ],
+)
+def test_noise_rounds_end_at_a_hopeless_misfit(
+    chi2: tuple[float, ...], rounds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = iter(chi2)
+    monkeypatch.setattr(fit, "_descend", lambda _, y, *__, **___: (y, None, None, 1))
+    monkeypatch.setattr(fit, "chi2_per_dof", lambda problem, y: next(left))
+
+    def with_force(level: float) -> Any:
+        mismatch = SimpleNamespace(level_m3=np.zeros(1))
+        return SimpleNamespace(mismatch=mismatch, force=np.array([level]))
+
+    *_, used = fit._fit_in_noise_rounds(
+        with_force(1.0), np.zeros(1), np.eye(1), 6, lambda one, y: with_force(2.0 * one.force[0])
+    )
+    assert used == rounds
+
+
+def test_a_hopeless_fit_is_not_repeated_with_free_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    where = SimpleNamespace(half_normal=np.arange(2), bridge=np.arange(2))
+    monkeypatch.setattr(optimum, "layout", lambda _: where)
+    monkeypatch.setattr(optimum, "fit_all", lambda *_: (found(1.0, 1), 7))
+    strategy = fit.SearchStrategy(0, False, 4, False)
+    for chi2, used in ((24.0, 7), (26.0, 0)):
+        restrained = found(chi2, 1)._replace(state=SimpleNamespace(y=np.ones(2)))
+        better, evaluations = optimum._with_free_ends(restrained, strategy)
+        assert (better.chi2_per_dof, evaluations) == (1.0 if used else chi2, used)
