@@ -1,9 +1,9 @@
 """Curvature of a crossing's likelihood: second-order terms in poorly determined directions.
 
 With different wheel paths a single crossing determines its longitudinal offset to half a metre and
-elements to a factor, and its optimum lies near the priors. A normal about that point lacks the
+elements only roughly, and its optimum lies near the priors. A normal about that point lacks the
 second-order terms from there to the truth. They are the same in all crossings of a survey, so that
-their number does not average them out. The products of such moves are therefore kept too, as few
+their number does not average them out. These terms are therefore kept too, as few
 sums of them as are significant, and fusion linearises each crossing again about the common
 estimate.
 """

@@ -1,9 +1,9 @@
 """Lateral wander of a truck's runs, from the shared part of their mismatches off the bridge.
 
-The runs of a wheel-path group are first aligned along the road: receivers err by half a metre, as
-long as the waves that show the wander. The road profile aligns them to centimetres. The shared
-fraction is the mean product of two runs' mismatches over the power that the estimated levels claim,
-so that the noise of the sensors, independent between runs, does not count as mismatch.
+The runs of a wheel-path group are first aligned along the road: receivers err by about the length
+of the waves that show the wander. The road profile aligns them to centimetres. The shared fraction
+is the mean product of two runs' mismatches over the power that the estimated levels claim, so that
+the noise of the sensors, independent between runs, does not count as mismatch.
 """
 
 from collections.abc import Sequence

@@ -143,7 +143,7 @@ def _fine_taus(log: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def is_consistent_with_zero(between: VariabilityPosterior) -> bool:
-    """Return whether no variability is about as likely as the most likely one."""
+    """Return whether zero variability is about as likely as the most likely."""
     density = between.within.reshape(_TAUS.size, len(_RHOS), _FINER).sum(axis=1)
     density /= np.diff(_edges())[:, None]
     return bool(density[0, 0] > _AS_LIKELY * density.max())

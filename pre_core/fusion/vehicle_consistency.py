@@ -1,4 +1,4 @@
-"""Detection of crossings by another truck than the others of its name.
+"""Detection of crossings by a truck other than the named one.
 
 Fusion assumes the same truck parameters in all crossings of a truck, and each crossing determines
 some of them to a thousandth. A crossing by another truck under this name, even one of the same

@@ -26,7 +26,7 @@ FloatArray = NDArray[np.float64]
 def from_models(car: HalfCar, beam: Beam) -> FloatArray:
     """Return the vector theta (p,) of a truck and a bridge of constant mass per length.
 
-    A half-car has no tandem, whose share is zero.
+    A half-car has no tandem: its share is zero.
 
     Raise ValueError for a beam of varying mass per length: the parameter rhoA is one number.
     """

@@ -166,8 +166,9 @@ def random_surface(
 ) -> Surface:
     """Return an isotropic surface whose profiles have an ISO 8608 class's geometric mean.
 
-    It is Gaussian. Waves along are even, with a period longer than the patch, so that it does not
-    repeat; lateral waves are denser where they are long. Waves are between 0.05 m and 100 m long.
+    It is Gaussian. Longitudinal waves are evenly spaced, their period longer than the patch, so
+    that it does not repeat; lateral waves are denser where they are long. Waves are between 0.05 m
+    and 100 m long.
     """
     rng = np.random.default_rng(seed)
     count = round((stop_m - start_m) / spacing_m) + 1

@@ -104,7 +104,7 @@ def speed_option(default: float, *, zero: str = "", group: str = "") -> Any:
 
 def config_option() -> Any:
     """Return `--config`: a file of options, which the command line overrides."""
-    text = "options by name, such as min_free = 800; the command line overrides them"
+    text = 'options by name, such as id = "a"; the command line overrides them'
     return file_option(text, "CONFIG.toml")
 
 

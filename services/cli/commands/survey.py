@@ -61,7 +61,7 @@ class SurveyPlanOptions:
         metavar="UG_PER_RTHZ",
     )
     wander: float = opt(
-        "lateral standard deviation between runs in m; it adds information (default: 0.12)",
+        "lateral standard deviation between runs in m; wander adds information (default: 0.12)",
         number("a standard deviation in m", low=0.01, high=1),
         default=0.12,
         metavar="M",
