@@ -249,10 +249,8 @@ def fit_all(
     y = _not_negative(problem, y)
     if not (problem.force.any() or is_accepted(problem, chi2_per_dof(problem, y))):
         problem = _at_misfit(problem, y)
-    if problem.force.any() and chi2_per_dof(problem, y) > _FAR_OFF_CHI2:
-        ending = Termination.STEPS_EXHAUSTED
-    elif problem.force.any():
-        problem, y, ending, used = _fit_in_noise_rounds(problem, y, free, _MAX_ROUNDS, _at_misfit)
+    if problem.force.any():
+        problem, y, ending, used = _fit_at_misfit(problem, y, free)
         evaluations += used
     state = levenberg_marquardt.initial_state(lambda at: all_rows(problem, at), y)
     found = Optimum(problem, state, ending, chi2_per_dof(problem, y), evaluations, 1)
@@ -261,6 +259,15 @@ def fit_all(
 
 def _at_full_weight(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
     return update_noise(problem, y, no_force_noise())
+
+
+def _fit_at_misfit(
+    problem: PosteriorProblem, y: FloatArray, directions: FloatArray
+) -> tuple[PosteriorProblem, FloatArray, Termination, int]:
+    """Fit along `directions` (f, d) with reduced suspension weight, unless y is far off."""
+    if chi2_per_dof(problem, y) > _FAR_OFF_CHI2:
+        return problem, y, Termination.STEPS_EXHAUSTED, 0
+    return _fit_in_noise_rounds(problem, y, directions, _MAX_ROUNDS, _at_misfit)
 
 
 def _at_misfit(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
