@@ -1,18 +1,22 @@
 """Recordings of simulated drives from a notebook, with every option of `driveby simulate`."""
 
-import argparse
-import difflib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Final
 
 from schemas.site import Site
 from schemas.site_file import site_toml
+from services.cli.config_file import options_by_key, unknown_key
 from services.cli.parser import add_command
 from services.cli.parsing import Parser
 from services.common.errors import InputError
+from services.common.options import option_of
 from services.execution.blas import one_blas_thread
 from services.notebook.read import Name
+
+_NOT_OF_NOTEBOOKS: Final = {"output", "verbose", "log_format", "debug"}
+"""Options that are an argument here, or belong to the command line."""
 
 
 def simulate_recording(output: Name, site: Name | Site | None = None, **options: object) -> Path:
@@ -30,20 +34,23 @@ def simulate_recording(output: Name, site: Name | Site | None = None, **options:
             site = path
         if site is not None:
             options["site"] = site
-        parsed = _parsed(*_arguments(options), f"--output={output}")
+        parser = Parser(prog="driveby", allow_abbrev=False)
+        command = add_command(parser.add_subparsers(parser_class=Parser), "simulate")
+        command.complete()
+        known = options_by_key(command).keys() - _NOT_OF_NOTEBOOKS
+        given = _arguments(options, sorted(known))
+        parsed = parser.parse_args(["simulate", *given, f"--output={output}"])
         with one_blas_thread():
             parsed.handler(parsed)
     return Path(output)
 
 
-def _arguments(options: dict[str, object]) -> Iterator[str]:
+def _arguments(options: dict[str, object], known: Sequence[str]) -> Iterator[str]:
     """Yield the arguments of the command."""
-    known = _names()
     for name, value in options.items():
         if name not in known:
-            close = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
-            raise InputError(f"{name}: is unknown, did you mean {close[0]}?")
-        option = f"--{name.replace('_', '-')}"
+            raise InputError(unknown_key(name, known))
+        option = option_of(name)
         if value is True:
             yield option
         elif isinstance(value, str) or not hasattr(value, "__iter__"):
@@ -51,17 +58,3 @@ def _arguments(options: dict[str, object]) -> Iterator[str]:
                 yield f"{option}={value}"
         else:
             yield f"{option}={(',' if name == 'ei' else ':').join(map(str, value))}"
-
-
-def _parsed(*arguments: str) -> argparse.Namespace:
-    parser = Parser(prog="driveby", allow_abbrev=False)
-    add_command(parser.add_subparsers(parser_class=Parser), "simulate")
-    return parser.parse_args(["simulate", *arguments])
-
-
-def _names() -> list[str]:
-    parser: argparse.ArgumentParser = _parsed("--scenario=1", "--output=x.mcap").parser
-    left_out = ("help", "output", "verbose", "log_format", "debug")
-    names = [action.option_strings[-1] for action in parser._actions if action.option_strings]
-    plain = [name.removeprefix("--").replace("-", "_") for name in names]
-    return [name for name in plain if name not in left_out]

@@ -6,7 +6,7 @@ is given as an argument.
 
 import argparse
 import difflib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -24,17 +24,27 @@ def with_config(parser: argparse.ArgumentParser, given: Sequence[str]) -> list[s
     path = _config_path(given)
     if path is None:
         return list(given)
-    actions = {_key(action): action for action in parser._actions if _key(action)}
+    actions = options_by_key(parser)
     overridden = _overridden(parser, given)
     arguments: list[str] = []
     for key, value in parse_toml(read_toml_text(path, "a configuration file"), str(path)).items():
         if key not in actions:
-            close = difflib.get_close_matches(key.replace("-", "_"), actions, n=1, cutoff=0.0)
-            raise InputError(f"{path}: {key}: is unknown, did you mean {close[0]}?")
+            raise InputError(f"{path}: {unknown_key(key, actions)}")
         of_key = list(_arguments_of(actions[key], f"{path}: {key}", value))
         if actions[key] not in overridden:
             arguments += of_key
     return [*arguments, *given]
+
+
+def options_by_key(parser: argparse.ArgumentParser) -> dict[str, argparse.Action]:
+    """Return the options that have a key, by their keys."""
+    return {_key(action): action for action in parser._actions if _key(action)}
+
+
+def unknown_key(key: str, known: Iterable[str]) -> str:
+    """Return the sentence on a key that is none of the known ones, with the nearest of them."""
+    (close,) = difflib.get_close_matches(key.replace("-", "_"), list(known), n=1, cutoff=0.0)
+    return f"{key}: is unknown, did you mean {close}?"
 
 
 def _config_path(given: Sequence[str]) -> Path | None:

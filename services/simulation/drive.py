@@ -7,7 +7,7 @@ steps of at most 0.1 ms, so that no identification shares its discretisation.
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,9 +46,6 @@ from services.simulation.wheel_paths import (
     WheelPaths,
     roads_of_surface,
 )
-
-if TYPE_CHECKING:
-    pass
 
 Floats = NDArray[np.float64]
 
