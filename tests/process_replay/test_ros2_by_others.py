@@ -22,7 +22,6 @@ from schemas.signals import NS_PER_S, decode_accel, decode_gnss
 from schemas.topics import selector
 from services.bus.session import open_session
 from services.bus.subscription import Subscription
-from services.cli.main import main
 from services.drives.ros2_messages import FIX, IMU, TWIST
 from services.drives.signals import Signals
 from services.recordings.recording import read_messages
@@ -38,6 +37,7 @@ from tests.process_replay.test_ros2_gateway import (
     one_run,
     ros,
     ros_site,
+    simulate_to,
 )
 from tests.waiting import LONGEST_S
 
@@ -100,8 +100,7 @@ def test_crossing_of_another_client_gives_the_same_as_directly(
     tmp_path: Path,
 ) -> None:
     direct, live = tmp_path / "direct.mcap", tmp_path / "live.mcap"
-    simulate = ["simulate", "--scenario", "6", "--noise", "25", "--gps-noise", "-o", str(direct)]
-    assert main(simulate) == 0
+    simulate_to(direct)
     messages = of_drive(direct)
     (tmp_path / "messages.json").write_text(json.dumps(messages))
     # A busy machine may publish seconds late.

@@ -140,6 +140,11 @@ def assert_same(one: Signals, other: Signals, most: float = 0.0) -> None:
         np.testing.assert_allclose(values, getattr(other.fixes, column), rtol=0, atol=most)
 
 
+def simulate_to(path: Path) -> None:
+    simulate = ["simulate", "--scenario", "6", "--noise", "25", "--gps-noise", "-o", str(path)]
+    assert main(simulate) == 0
+
+
 def estimate(path: Path) -> dict[str, Any]:
     results = path.with_suffix(".json")
     assert main(["identify", str(path), "--json", str(results)]) == 0
@@ -157,8 +162,7 @@ def test_a_crossing_gives_the_same_as_directly_and_as_from_a_file(
     tmp_path: Path,
 ) -> None:
     direct, live = tmp_path / "direct.mcap", tmp_path / "live.mcap"
-    simulate = ["simulate", "--scenario", "6", "--noise", "25", "--gps-noise", "-o", str(direct)]
-    assert main(simulate) == 0
+    simulate_to(direct)
     messages = ros2.of_recording(direct)
     logger = start_logger(start, endpoint, live, site=ros_site)
     process = gateway("--spool", str(tmp_path / "spool"))
