@@ -1,5 +1,6 @@
 """A search ends: the walk along the road has a reach, and the whole has a budget."""
 
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,21 +20,36 @@ def found(chi2: float, evaluations: int, ending: Termination = Termination.CONVE
     return Optimum(unknown, unknown, ending, chi2, evaluations, 1)
 
 
-def test_the_walk_has_a_reach_however_little_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The further away, the better it fits: only the reach ends this walk."""
-    seen: list[float] = []
+def scanned(
+    objective: Callable[[float], float],
+    per_m: float,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    is_tandem: bool = False,
+) -> tuple[list[walk.Placement], int]:
+    """Scan with this objective of a shift; `per_m` is one over the offset's spread."""
 
     def look(shift: float, start: Any) -> Any:
-        seen.append(shift)
-        assert len(seen) < 1000
-        return walk.Placement(-abs(shift), shift, start, np.zeros(0, np.int64)), 1
+        return walk.Placement(objective(shift), shift, start, np.zeros(0, np.int64)), 1
 
     bridge = SimpleNamespace(bridge=np.arange(3))
     monkeypatch.setattr(walk, "_local_fit", lambda problem, y, way: look)
     monkeypatch.setattr(walk, "layout", lambda problem: bridge)
-    monkeypatch.setattr(walk, "has_tandem", lambda problem: False)
-    problem: Any = SimpleNamespace(receiver_rows=np.array([[1e-9]]))
-    _, evaluations = walk.scan_offsets(problem, np.zeros(4), optimum._SIMPLEST)
+    monkeypatch.setattr(walk, "has_tandem", lambda problem: is_tandem)
+    problem: Any = SimpleNamespace(receiver_rows=np.array([[per_m]]))
+    return walk.scan_offsets(problem, np.zeros(4), optimum._SIMPLEST)
+
+
+def test_the_walk_has_a_reach_however_little_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The further away, the better it fits: only the reach ends this walk."""
+    seen: list[float] = []
+
+    def objective(shift: float) -> float:
+        seen.append(shift)
+        assert len(seen) < 1000
+        return -abs(shift)
+
+    _, evaluations = scanned(objective, 1e-9, monkeypatch)
     assert max(map(abs, seen)) < 40.0
     assert evaluations < 200
 
@@ -44,17 +60,10 @@ def test_the_scan_passes_other_minima_of_a_tandem(
 ) -> None:
     """Objectives of a crossing whose receiver was three metres off, and of a minimum beside it."""
 
-    def look(shift: float, start: Any) -> Any:
-        here = 438.0 + 5.0 * (shift - 0.75) ** 2
-        there = 422.0 + 40.0 * (shift + 3.0) ** 2
-        return walk.Placement(min(here, there), shift, start, np.zeros(0, np.int64)), 1
+    def objective(shift: float) -> float:
+        return min(438.0 + 5.0 * (shift - 0.75) ** 2, 422.0 + 40.0 * (shift + 3.0) ** 2)
 
-    bridge = SimpleNamespace(bridge=np.arange(3))
-    monkeypatch.setattr(walk, "_local_fit", lambda problem, y, way: look)
-    monkeypatch.setattr(walk, "layout", lambda problem: bridge)
-    monkeypatch.setattr(walk, "has_tandem", lambda problem: is_tandem)
-    problem: Any = SimpleNamespace(receiver_rows=np.array([[0.55]]))
-    places, _ = walk.scan_offsets(problem, np.zeros(4), optimum._SIMPLEST)
+    places, _ = scanned(objective, 0.55, monkeypatch, is_tandem=is_tandem)
     assert places[0].shift_m == pytest.approx(chosen_m, abs=1e-9)
 
 
