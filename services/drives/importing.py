@@ -11,7 +11,7 @@ from schemas.site_file import load_site, parse_site, read_site_text
 from schemas.topics import Message
 from services.common.errors import InputError
 from services.common.files import check_writable
-from services.common.naming import checked_identifier, identifier_from
+from services.common.naming import checked_identifier
 from services.common.progress import Steps, no_step_progress
 from services.drives.comma2k19 import is_comma2k19, read_comma2k19
 from services.drives.csv_runs import (
@@ -31,6 +31,8 @@ from services.recordings.writer import write_recording
 
 _log = logging.getLogger(__name__)
 _REALM = "import-"
+_SHARED = "drives"
+"""Name of the realm of drives for which neither command nor site file names one."""
 _LARGEST_RATE_ERROR = 0.05
 """Largest relative error of a rate; wrong units and wrong site files exceed it by far."""
 
@@ -62,7 +64,7 @@ def import_command(
     text, name = read_site_text(asked.site), str(asked.site)
     site = parse_site(text, name)
     vehicle_id = vehicle_of(site, name, asked.vehicle)
-    drive = _Drive(text, site, name, vehicle_id, _realm(asked.sources, site, asked.realm))
+    drive = _Drive(text, site, name, vehicle_id, _realm(site, asked.realm))
     if len(asked.sources) == 1 and is_ros2(asked.sources[0]):
         return _import_ros2(asked.sources[0], drive, output, force=asked.force)
     runs = normalised_runs(asked.sources, site, name, vehicle_id, how)
@@ -128,7 +130,7 @@ def messages_of_folder(
     """Return the same for a site that was read already; errors name it `site_name`."""
     vehicle_id = vehicle_of(site, site_name, vehicle)
     runs = normalised_runs([folder], site, site_name, vehicle_id)
-    return run_to_messages(runs, site, _realm([folder], site, None), vehicle_id)
+    return run_to_messages(runs, site, _realm(site, None), vehicle_id)
 
 
 def _with_progress(
@@ -191,13 +193,11 @@ def vehicle_of(site: Site, site_name: str, wanted: str | None) -> str:
     raise InputError(f"{site_name}: {problem}, choose with --vehicle one of {', '.join(known)}")
 
 
-def _realm(sources: Sequence[Path], site: Site, name: str | None) -> str:
-    """Return the realm of a drive: as named, else that of the site file, else of the folder."""
+def _realm(site: Site, name: str | None) -> str:
+    """Return the realm of a drive: as named, else that of the site file, else one for all drives.
+
+    Folders are those of one campaign more often than not, and only drives of one realm are fused.
+    """
     if name is not None:
         return f"{_REALM}{checked_identifier(name.removeprefix(_REALM), '--realm')}"
-    if site.imports is not None:
-        return f"{_REALM}{site.imports.name}"
-    first = sources[0].resolve()
-    if first.suffix in (".mcap", ".db3"):
-        return f"{_REALM}{identifier_from(first.stem)}"
-    return f"{_REALM}{identifier_from((first.parent if first.suffix == '.csv' else first).name)}"
+    return f"{_REALM}{_SHARED if site.imports is None else site.imports.name}"

@@ -80,7 +80,7 @@ def test_import_writes_a_recording_with_its_site(
     output = drive.parent / "drive.mcap"
     code, out, err = run(capsys, "import", drive, "--site", drive / "site.toml", "-o", output)
     assert (code, err) == (0, "")
-    assert out == (f"{output}: 1 run of truck-x, 6.0 s, 241 messages, realm import-drive\n")
+    assert out == (f"{output}: 1 run of truck-x, 6.0 s, 241 messages, realm import-drives\n")
     assert read_site(output) == (drive / "site.toml").read_text()
     assert sum(read_info(output).messages.values()) == 241
     before = output.read_bytes()
@@ -98,7 +98,7 @@ def test_import_of_a_real_drive(
     code, out, err = run(capsys, "import", drive, "--site", EXAMPLE / "site.toml", "-o", output)
     assert (code, err) == (0, "")
     assert "1 run of truck-x, 60.0 s, " in out
-    prefix = "driveby/v1/import-comma2k19/vehicle/truck-x"
+    prefix = "driveby/v1/import-drives/vehicle/truck-x"
     counts = read_info(output).messages
     assert counts[f"{prefix}/gnss"] == counts[f"{prefix}/location"] == 579
     assert counts[f"{prefix}/accel"] == 1251
@@ -276,12 +276,16 @@ def test_imports_of_one_campaign_share_a_realm(
     site, output = drive / "site.toml", drive.parent / "out.mcap"
     arguments = ("import", drive, "--site", site, "--force", "-o", output)
 
-    def realm(*more: str) -> str:
+    def realm(*more: object) -> str:
         assert run(capsys, *arguments, *more)[0] == 0
         (found,) = {topic.split("/")[2] for topic in read_info(output).messages}
         return found
 
-    assert realm() == f"import-{drive.name}"
+    assert realm() == "import-drives"
+    drive = drive.rename(drive.parent / "later")
+    site = drive / "site.toml"
+    arguments = ("import", drive, "--site", site, "--force", "-o", output)
+    assert realm() == "import-drives"
     site.write_text(site.read_text() + '\n[import]\nname = "isar"\n')
     assert realm() == "import-isar"
     assert realm("--realm", "elbe") == "import-elbe"

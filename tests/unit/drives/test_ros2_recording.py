@@ -90,7 +90,7 @@ def test_a_recording_becomes_one_of_ours(
         )
     assert set(run.channels) == set(ros2.TOPICS)
     assert run.fixes.speed_m_per_s.tolist() == [10.0] * 30
-    assert {found.key.realm for found in read_messages(output)} == {"import-drive-3"}
+    assert {found.key.realm for found in read_messages(output)} == {"import-drives"}
 
 
 def test_a_channel_that_the_site_does_not_name_is_not_there(
