@@ -11,7 +11,7 @@ from services.common.kinds import RESULTS
 from services.execution.blas import one_blas_thread
 from services.execution.fuse_results import FusedElements, crossings_to_fuse, fuse_crossings
 from services.notebook.read import Name
-from services.notebook.showing import html_table
+from services.notebook.showing import RIGIDITY_HEAD, html_table, rigidity_cells
 from services.notebook.solution import Identification
 
 
@@ -41,16 +41,11 @@ class Fusion(NamedTuple):
         for name, state in self.bridges.items():
             nominal = self.elements_of[name].nominal_flexural_rigidity_nm2
             rows = [
-                (
-                    element,
-                    f"{one.mean / 1e9:.3g}",
-                    f"{one.q025 / 1e9:.3g} to {one.q975 / 1e9:.3g}",
-                    f"{one.mean / sound:.2f}",
-                )
+                (element, *rigidity_cells(one, sound))
                 for (element, one), sound in zip(state.elements.items(), nominal, strict=True)
             ]
-            head = ("element", "EI (GN·m²)", "95 % interval", "EI/nominal")
-            parts.append(f"<p>{escape(self._line(name))}</p>{html_table(head, rows)}")
+            table = html_table(("element", *RIGIDITY_HEAD), rows)
+            parts.append(f"<p>{escape(self._line(name))}</p>{table}")
         return "".join(parts)
 
     def _line(self, name: str) -> str:

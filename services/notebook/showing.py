@@ -6,11 +6,12 @@ from html import escape
 from typing import Final
 
 from schemas.reasons import Reason
-from schemas.results import CrossingResult, Parameter
+from schemas.results import CrossingResult, ElementState, Parameter
 from schemas.site import Bridge
 
 MAX_SHOWN: Final = 20
 """Largest number of crossings that a notebook shows."""
+RIGIDITY_HEAD: Final = ("EI (GN·m²)", "95 % interval", "EI/nominal")
 _GIGA: Final = 1e9
 
 
@@ -21,7 +22,7 @@ def one_line(crossing: CrossingResult, bridge: Bridge) -> str:
         parts.append(f"({', '.join(crossing.reasons)})")
     elements = [ratio for _, _, ratio in _elements(crossing, bridge)]
     if elements:
-        parts.append(f"EI of nominal {' '.join(f'{ratio:.2f}' for ratio in elements)}")
+        parts.append(f"EI of nominal {' '.join(f'{ratio:.3f}' for ratio in elements)}")
     return " ".join(parts)
 
 
@@ -52,14 +53,11 @@ def as_html(crossing: CrossingResult, bridge: Bridge) -> str:
     for length_m, (name, found, ratio) in zip(
         bridge.lengths_m, _elements(crossing, bridge), strict=False
     ):
-        interval = f"{found.q025 / _GIGA:.3g} to {found.q975 / _GIGA:.3g}" if has_interval else "–"
-        cells = (name, f"{start_m:.1f} to {start_m + length_m:.1f}", f"{found.mean / _GIGA:.3g}")
-        rows.append((*cells, interval, f"{ratio:.2f}"))
+        place = f"{start_m:.1f} to {start_m + length_m:.1f}"
+        rows.append((name, place, *rigidity_cells(found, found.mean / ratio, has_interval)))
         start_m += length_m
     if rows:
-        parts.append(
-            html_table(("element", "m", "EI (GN·m²)", "95 % interval", "EI/nominal"), rows)
-        )
+        parts.append(html_table(("element", "m", *RIGIDITY_HEAD), rows))
     return "".join(parts)
 
 
@@ -79,6 +77,14 @@ def _elements(crossing: CrossingResult, bridge: Bridge) -> list[tuple[str, Param
         for name, sound in ((f"EI_{n + 1}", sound) for n, sound in enumerate(nominal))
         if name in known
     ]
+
+
+def rigidity_cells(
+    found: Parameter | ElementState, nominal: float, has_interval: bool = True
+) -> tuple[str, str, str]:
+    """Return EI, its interval and its ratio to nominal, with the digits of the terminal."""
+    interval = f"{found.q025 / _GIGA:.2f} to {found.q975 / _GIGA:.2f}" if has_interval else "–"
+    return f"{found.mean / _GIGA:.2f}", interval, f"{found.mean / nominal:.3f}"
 
 
 def html_table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import driveby
+from schemas.results import ElementState, Parameter
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
 from schemas.topics import Message
@@ -281,6 +283,11 @@ def test_the_command_line_says_the_same(
     assert first.equals(found.posterior())
 
 
+def as_in_the_terminal(found: Parameter | ElementState, nominal: float) -> list[str]:
+    mean, low, high = (f"{value / 1e9:.2f}" for value in (found.mean, found.q025, found.q975))
+    return [mean, f"{low} to {high}", f"{found.mean / nominal:.3f}"]
+
+
 def test_results_are_short_in_a_notebook(
     found: driveby.Identification, simulation: driveby.Simulation
 ) -> None:
@@ -295,7 +302,10 @@ def test_results_are_short_in_a_notebook(
     for page in (found._repr_html_(), solution._repr_html_()):
         assert len(page) < 5000
         assert page.count("<tr>") == 8
-        assert "<td>EI_4</td><td>12.9 to 17.1</td>" in page
+        (row,) = re.findall("<td>EI_4</td><td>12.9 to 17.1</td>(.*?)</tr>", page)
+        assert re.findall(r"<td>(.*?)</td>", row) == as_in_the_terminal(
+            solution.value["EI_4"], 15.6e9
+        )
     assert "980 more crossings" in many._repr_html_()
     named = solution.crossing.model_copy(update={"vehicle": "<b>x</b>"})
     assert "<b>x" not in solution._replace(crossing=named)._repr_html_()
@@ -564,7 +574,9 @@ def test_fused_bridge_is_that_of_the_command_line(tmp_path: Path) -> None:
     assert mine == theirs
     assert list(fused.bridges) == ["bridge-1"]
     assert repr(fused).startswith("<Fusion bridge-1: 5 crossings fused, good")
-    assert "<td>EI_1</td>" in fused._repr_html_()
+    cells = as_in_the_terminal(fused.bridges["bridge-1"].elements["EI_1"], 16e9)
+    row = "".join(f"<td>{cell}</td>" for cell in cells)
+    assert f"<td>EI_1</td>{row}" in fused._repr_html_()
     again = driveby.fuse(fused.results, baseline=fused.results)
     assert again.bridges["bridge-1"].probability_of_loss is not None
     with pytest.raises(driveby.InputError, match="no results given"):
