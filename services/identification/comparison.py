@@ -235,7 +235,7 @@ def sentences(found: Comparison | None, language: Language = ENGLISH) -> list[st
     wordings += [_change("stiffer", found, e, language) for e in found.stiff]
     if found.rest:
         farthest = max(abs(1.0 - e.ratio) for e in found.rest)
-        values = {"within": max(1, _per_cent_up(farthest)), "loss": _smallest_seen(found.rest)}
+        values = {"within": max(1, per_cent_up(farthest)), "loss": _smallest_seen(found.rest)}
         which = "rest" if wordings else "all"
         wordings.append(language.text(f"{which}.{found.reference}", **values))
     return wordings
@@ -243,10 +243,11 @@ def sentences(found: Comparison | None, language: Language = ENGLISH) -> list[st
 
 def _smallest_seen(elements: Sequence[Element]) -> int:
     """Return the loss in per cent that would have been clear in each of the elements."""
-    return _per_cent_up(max(element.visible_loss for element in elements))
+    return per_cent_up(max(element.visible_loss for element in elements))
 
 
-def _per_cent_up(share: float) -> int:
+def per_cent_up(share: float) -> int:
+    """Return a share in per cent, rounded up: so much and no less is sure to be seen."""
     return int(np.ceil(100.0 * share - 1e-6))
 
 

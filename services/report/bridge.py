@@ -17,7 +17,7 @@ from services.execution.blas import one_blas_thread
 from services.history.bridge_history import BridgeHistory, bridge_history
 from services.history.history_store import bridges_of
 from services.history.periods import Unit
-from services.identification.comparison import Comparison, Estimate, compare
+from services.identification.comparison import Comparison, Estimate, compare, per_cent_up
 from services.viewer.baseline import named_baseline, stored_baseline
 from services.viewer.bridge_view import BridgeView, describe_bridge, view_of_bridge
 
@@ -267,9 +267,9 @@ def _seen(found: Comparison, language: Language) -> str:
     best, *_, worst = sorted(found.elements, key=lambda one: one.visible_loss)
     return language.text(
         "finding.seen",
-        low=100.0 * best.visible_loss,
+        low=per_cent_up(best.visible_loss),
         best=best.number,
-        high=100.0 * worst.visible_loss,
+        high=per_cent_up(worst.visible_loss),
         worst=worst.number,
     )
 

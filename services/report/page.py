@@ -10,7 +10,7 @@ import matplotlib
 from schemas.results import CrossingResult
 from services.common.language import ENGLISH, Language
 from services.common.progress import Steps, no_step_progress
-from services.identification.comparison import Comparison, Element
+from services.identification.comparison import Comparison, Element, per_cent_up
 from services.report.advice import next_steps
 from services.report.bridge import BridgeReport, reasons_of
 from services.report.evidence import evidence, facts, pictured, road_of
@@ -254,7 +254,7 @@ def _caveats(report: BridgeReport, language: Language) -> Iterator[Html]:
 
 def _visible(comparison: Comparison, language: Language) -> str:
     losses = sorted(element.visible_loss for element in comparison.elements)
-    return language.text("note.visible", low=100.0 * losses[0], high=100.0 * losses[-1])
+    return language.text("note.visible", low=per_cent_up(losses[0]), high=per_cent_up(losses[-1]))
 
 
 def _road(crossings: Sequence[CrossingResult], language: Language) -> str:

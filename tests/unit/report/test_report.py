@@ -75,6 +75,7 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     assert (
         "No other element differs clearly (at most 3 %); only losses above 16 % would show." in text
     )
+    assert "where it is least accurate, one of 16 %." in text
     assert (
         "Bridge 30 m, 7 elements, counted from the south-west end (36.11060° N, 140.10100° E)"
         in text
