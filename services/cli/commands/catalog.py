@@ -75,8 +75,10 @@ def _summary(rows: "list[CatalogRow]", added: int) -> str:
         f"{len(vehicles)} truck{'s' if len(vehicles) != 1 else ''}, {size / 1e6:.1f} MB, "
         f"{gaps} gap{'s' if gaps != 1 else ''}"
     )
-    if rows:
-        said += f", {_time(rows[0].first_ns)} to {_time(max(row.last_ns for row in rows))}"
+    measured = [row for row in rows if row.first_ns]  # recordings of results have no measurement
+    if measured:
+        begin, end = min(row.first_ns for row in measured), max(row.last_ns for row in measured)
+        said += f", {_time(begin)} to {_time(end)}"
     return said
 
 

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from schemas.proto import driveby_pb2 as pb
 from schemas.signals import AccelBatch, AccelChannel, GnssFix, encode_accel, encode_gnss
 from schemas.site import Site
 from schemas.site_file import load_site
@@ -390,6 +391,21 @@ def test_the_command(
     assert table.read_text().count("through") == 3
     assert cli.main(["catalog", str(tmp_path / "nowhere")]) == 2
     assert capsys.readouterr().err == f"driveby: {tmp_path / 'nowhere'}: no such folder\n"
+
+
+def test_a_recording_without_measurements_does_not_begin_the_fleet(
+    fleet: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Recordings of results have no time of measurement: the fleet began in 1970."""
+    assert cli.main(["catalog", str(fleet)]) == 0
+    before = capsys.readouterr().out.partition(" gap")[2].partition("\n")[0]
+    health = pb.Health(schema_version=1, service="logger", time_ns=START_NS).SerializeToString()
+    where = Key("live", "service", "logger", "health")
+    record(fleet / "_service.mcap", iter([Message(where, health, 1, 1, START_NS, START_NS)]))
+    assert cli.main(["catalog", str(fleet)]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("4 recordings (1 new to the catalogue)")
+    assert said.partition(" gap")[2].partition("\n")[0] == before
 
 
 def test_an_import_adds_its_row_where_there_is_a_catalogue(
