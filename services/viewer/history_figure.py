@@ -38,8 +38,11 @@ _LINE_CHARACTERS = 105
 """Maximum length of a line of a sentence."""
 _MAX_PER_CENT = 400.0
 """Upper end of the axes; an interval beyond it means that the element is unresolved."""
-_LEAST_DAYS = 7.0
-"""Minimum time shown before the first and behind the last period."""
+_LEAST_DAYS = {"day": 3.0, "week": 7.0, "month": 31.0}
+"""Minimum time shown before the first and behind the last middle of a period: all of it, at least.
+
+A point in the middle of an axis of two weeks would seem to be of that day, not of that month.
+"""
 
 
 class PeriodPoint(NamedTuple):
@@ -149,7 +152,8 @@ def draw_history(history: HistoryView) -> Figure:
         axes.tick_params(labelbottom=n == elements - 1 and not has_temperature)
     if first is not None:
         days = _dates(point.time_s for point in history.points)
-        margin = max(_LEAST_DAYS, 0.04 * (max(days) - min(days)))
+        least = _LEAST_DAYS.get(history.unit, 7.0)
+        margin = max(least, 0.04 * (max(days) - min(days)))
         first.set_xlim(min(days) - margin, max(days) + margin)
     if has_temperature and first is not None:
         size = (LEFT, bottom / height, RIGHT - LEFT, (_TEMPERATURE_IN - 0.1) / height)

@@ -98,6 +98,12 @@ def test_every_good_interval_is_within_its_panel() -> None:
         assert len([tick for tick in axes.get_yticks() if low <= tick <= high]) >= 3
 
 
+def test_one_month_is_shown_as_a_month_not_as_a_day_of_it() -> None:
+    (first, _) = drawn(HistoryView("b-1", "month", weeks(1.0), (), ())).axes
+    begin, end = first.get_xlim()
+    assert 60.0 < end - begin < 90.0
+
+
 def test_one_week_is_shown_over_weeks_not_years() -> None:
     (first, _) = drawn(HistoryView("b-1", "week", weeks(1.0), (), ())).axes
     begin, end = first.get_xlim()
