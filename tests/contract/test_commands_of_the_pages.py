@@ -118,7 +118,7 @@ NOT_RUN = {
     'pip install "arviz<1"': NETWORK,
     "driveby view crossing.rrd": WINDOW,
     f"driveby view {SAMPLE}": WINDOW,
-    "driveby logger --realm sim-first": FOUR,
+    "driveby logger --realm sim-first --site docs/site.example.toml": FOUR,
     "driveby worker --realm sim-first --site docs/site.example.toml": FOUR,
     "driveby watch --realm sim-first": FOUR,
     "driveby truck recordings/sample/crossing.mcap --realm sim-first": FOUR,
