@@ -165,7 +165,7 @@ def _draw_crossings(axes: Axes, bridge: BridgeView, places: BarPlaces, language:
         return 0.0
     highest = 0.0
     named: set[str] = set()
-    for place, crossing in zip(np.linspace(-0.38, -0.2, len(drawn)), drawn, strict=True):
+    for place, crossing in zip(np.linspace(-0.4, -0.26, len(drawn)), drawn, strict=True):
         assert crossing.rigidity_nm2 is not None  # noqa: S101 - chosen by that
         values = crossing.rigidity_nm2 / 1e9
         good = crossing.verdict == "good"
@@ -179,7 +179,7 @@ def _draw_crossings(axes: Axes, bridge: BridgeView, places: BarPlaces, language:
             color=INK,
             markerfacecolor=INK if good else "white",
             markeredgewidth=0.9,
-            zorder=6,
+            zorder=9,  # above the plates of all labels: they hid measurements
             label=None if crossing.verdict in named else label,
         )
         named.add(crossing.verdict)

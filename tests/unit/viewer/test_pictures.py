@@ -130,6 +130,17 @@ def test_all_crossings_are_listed_and_drawn_with_their_verdict(site: Site) -> No
     assert_words_apart(figure)
 
 
+def test_no_label_hides_a_single_crossing(site: Site) -> None:
+    """Plates of values and losses stood over the dots of the crossings beside the interval."""
+    view = bridge_of(
+        site, *(some_crossing(f"c{n}", entry=n * 86400.0) for n in range(4)), used="c3"
+    )
+    axes = draw_bridge(view).axes[0]
+    dots = [line for line in axes.lines if line.get_marker() == "o"]
+    assert len(dots) == 4
+    assert min(d.get_zorder() for d in dots) > max(t.get_zorder() for t in axes.texts)
+
+
 @pytest.mark.parametrize("name", ["x" * 60, "A 13 / <b>bridge</b> over $\\frac$ \\river"])
 def test_long_and_strange_names_of_an_owner_stand_on_the_page(site: Site, name: str) -> None:
     view = bridge_of(site, some_crossing("a"), used="a")._replace(owner_id=name)
