@@ -16,7 +16,7 @@ import pytest
 
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
-from services.recordings.recording import read_messages
+from services.recordings.recording import read_messages, read_site
 from tests.process_replay.starting import Start, start_logger
 from tests.waiting import LONGEST_S, until
 
@@ -80,6 +80,8 @@ def test_what_the_readme_says_happens(endpoint: str, project: Path, tmp_path: Pa
     recorded = [*(tmp_path / "recordings/sim-first").glob("*/truck-1-*.mcap")]
     streams = {m.key.stream for path in recorded for m in read_messages(path)}
     assert {"accel", "gnss", "info", "estimate"} <= streams
+    for path in recorded:  # else `identify` would ask for a site file
+        assert read_site(path) == (tmp_path / "docs/site.example.toml").read_text()
 
 
 def test_a_worker_in_the_wrong_realm_says_so(
