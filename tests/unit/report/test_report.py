@@ -476,6 +476,26 @@ def without_weak(site: Site, spreads: list[float]) -> Results:
     return fused(site, spreads, EI_4=like_others.elements["EI_3"].model_dump(), level=level)
 
 
+def test_on_paper_all_measures_and_the_signature_are_on_the_sheet_of_the_crossings(
+    site: Site, tmp_path: Path
+) -> None:
+    """The line for the signature was alone on the last sheet."""
+    try:
+        browser = pdf.find_browser()
+    except FailureError as error:
+        pytest.skip(str(error))
+    content = fused(site, KNOWN).model_dump(mode="json")
+    for one in content["crossings"]:
+        one["derived"]["probability_torsion"] = 0.03
+        one["diagnostics"]["position_shift_m"] = 1.89
+    html = tmp_path / "r.html"
+    found = Results.model_validate(content)
+    html.write_text(page(bridge_reports([(Path("drive.json"), found, site)], None)))
+    pdf.write_pdf(html, tmp_path / "r.pdf", browser)
+    printed = (tmp_path / "r.pdf").read_bytes()
+    assert len(re.findall(rb"/Type\s*/Page\b", printed)) == 2
+
+
 def test_on_paper_the_first_page_of_an_end_that_is_weak_is_one_sheet(
     site: Site, tmp_path: Path
 ) -> None:
