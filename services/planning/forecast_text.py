@@ -93,7 +93,7 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     wanted = percent(DETECTION_PROBABILITY)
     yield f"smallest: at midspan; needed, ends: crossings until it is seen with {wanted}"
     yield f"at midspan, at both ends (elsewhere between them); –: more than {MAX_CROSSINGS};"
-    yield "t: within the legal axle and total loads; the other way: in the other lane;"
+    yield "t: if legal axle and total loads allow it; the other way: in the other lane;"
     yield "elements: longer ones"
     yield ""
     for line in warnings(found):

@@ -33,6 +33,7 @@ def test_a_plan_of_the_example(
     arguments = ["survey", "--site", str(project / "docs/site.example.toml"), "--speed", "10"]
     assert cli.main([*arguments, "--json", str(found), "--figure", str(picture)]) == 0
     out = capsys.readouterr().out
+    assert "t: if legal axle and total loads allow it" in out  # no mass is known to be legal
     plan = json.loads(found.read_text(encoding="utf-8"))
     assert picture.stat().st_size > 10_000
     planned = plan["planned"]["all_crossings"]
