@@ -79,3 +79,14 @@ def test_bad_input(
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_the_last_line_says_that_nothing_is_wrong(
+    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (project / "docs/site.example.toml").read_text(encoding="utf-8")
+    known = "cg_height_m = 1.3\ntwin_tyre_distance_m = [0.0, 0.0]\ntyre_width_m = [0.3, 0.3]\n"
+    site = tmp_path / "site.toml"
+    site.write_text(text.replace("[vehicle]\n", f"[vehicle]\n{known}", 1))
+    assert cli.main(["check", str(site)]) == 0
+    assert capsys.readouterr().out.endswith("\nno finding speaks against a survey\n")
