@@ -1,5 +1,6 @@
 """`make faults` and `make soak`: what they run, and that nothing of it is left behind."""
 
+import json
 import os
 import re
 import shlex
@@ -25,19 +26,37 @@ def arguments_of(project: Path, target: str) -> list[str]:
     return shlex.split(rule[1].strip().rpartition("-m pytest ")[2])
 
 
-def collected(project: Path, arguments: list[str]) -> set[str]:
+COLLECT = """
+import json
+import sys
+
+import pytest
+
+for arguments in json.loads(sys.argv[1]):
+    code = pytest.main([*arguments, "--collect-only", "-q"])
+    print("exit code", int(code), flush=True)
+"""
+
+
+def collected(project: Path, *selections: list[str]) -> list[set[str]]:
+    """What each selection collects, in one process: most of the time is the first's imports."""
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", *arguments, "--collect-only", "-q"],
+        [sys.executable, "-c", COLLECT, json.dumps(selections)],
         cwd=project, capture_output=True, text=True, timeout=LONGEST_S, check=False,
     )  # fmt: skip
-    assert done.returncode == 0, done.stdout
-    return {line for line in done.stdout.splitlines() if "::" in line}
+    assert done.returncode == 0, done.stderr
+    *parts, end = done.stdout.split("exit code 0\n")
+    assert (len(parts), end) == (len(selections), ""), done.stdout
+    return [{line for line in part.splitlines() if "::" in line} for part in parts]
 
 
 def test_faults_runs_everything_but_the_soak(project: Path) -> None:
-    faults = collected(project, arguments_of(project, "faults"))
-    soak = collected(project, arguments_of(project, "soak"))
-    every = collected(project, ["tests/faults", "-m", "soak or not soak"])
+    faults, soak, every = collected(
+        project,
+        arguments_of(project, "faults"),
+        arguments_of(project, "soak"),
+        ["tests/faults", "-m", "soak or not soak"],
+    )
     assert {name.partition("::")[2].partition("[")[0] for name in soak} == {
         "test_killed_fifty_times",
         "test_an_hour_at_the_rated_load",
