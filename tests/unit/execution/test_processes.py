@@ -208,7 +208,7 @@ def test_a_process_that_is_hung_once_costs_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DEADLY_ONCE", str(tmp_path))
-    limits = TaskLimits(processor_s=8.0)
+    limits = TaskLimits(processor_s=4.0)
     with ProcessExecutor(1, identify=busy_once, prepare=nothing, limits=limits) as processes:
         processes.submit(works()[0])
         (finished,) = all_of(processes)
