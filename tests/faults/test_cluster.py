@@ -33,8 +33,8 @@ from tests.waiting import until
 
 pytestmark = pytest.mark.process
 
-CROSSINGS = 30
-HELD = "20260101T032003"
+CROSSINGS = 20
+HELD = "20260101T014003"
 """When the first crossing begins that workers can be made to hold, as all later ones."""
 _HOLDING = """
 import time
