@@ -41,6 +41,12 @@ def mismatch_excess(problem: PosteriorProblem, y: FloatArray) -> float:
     return float(level.sum() / expected.sum()) if expected.sum() > 0.0 else 0.0
 
 
+def surface_level_at(problem: PosteriorProblem, y: FloatArray) -> float:
+    """Return Phi k^3 in m² of the surface off the bridge at y (size,), 0 without an estimate."""
+    _, _, expected = _levels_off_bridge(problem, y)
+    return float(expected[1] / problem.mismatch.shapes.expected_m[1])
+
+
 def _levels_off_bridge(
     problem: PosteriorProblem, y: FloatArray
 ) -> tuple[FloatArray, float, FloatArray]:

@@ -205,6 +205,8 @@ def _refine_likeliest(
     wrong. After `max_evaluations` evaluations no other candidate is tried.
     """
     force = no_force_noise() if strategy.uses_suspension else None
+    # With the noise of a front axle ahead of a tandem, offsets metres apart would fit alike.
+    front_axle, problem = problem.front_axle, problem._replace(front_axle=None)
     problem, y, evaluations = _find_truck(problem, y, strategy, report, force)
     power = noise_power_ratio(problem, y)
     if power > HOPELESS_NOISE:
@@ -219,6 +221,7 @@ def _refine_likeliest(
     report("finding the bridge", 0.2)
     places, used = scan_offsets(problem, y, strategy)
     evaluations += used
+    problem = problem._replace(front_axle=front_axle)
     best: Optimum | None = None
     has_friction = False
     tried: list[float] = []

@@ -18,7 +18,7 @@ from pre_core.crossing import noise as _noise
 from pre_core.crossing import splines
 from pre_core.crossing.layout import CHANNELS, ParameterLayout, parameter_layout
 from pre_core.crossing.lines import project_out
-from pre_core.crossing.mismatch import Mismatch
+from pre_core.crossing.mismatch import Mismatch, MismatchSpectra
 from pre_core.crossing.noise import NoisePath, force_masses, noise_path
 from pre_core.crossing.residuals import (
     SWING_MODES,
@@ -105,6 +105,8 @@ class PosteriorProblem(NamedTuple):
     """Frequencies in the rows of the removed lines, see `lines`."""
     line_waves: FloatArray = np.zeros((0, 0))
     """(m, w) orthonormal waves of these lines."""
+    front_axle: MismatchSpectra | None = None
+    """Spectra of the profile of the axle ahead of a tandem less that of the tandem."""
 
 
 def has_tandem(problem: PosteriorProblem) -> bool:

@@ -8,6 +8,7 @@ import numpy as np
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import lines
 from pre_core.crossing.channels import A, channel_signals
+from pre_core.crossing.front_axle import without_front_axle
 from pre_core.crossing.mismatch import BridgePavement, Mismatch, mismatch_spectra
 from pre_core.crossing.noise import (
     FRICTION_GAIN,
@@ -89,6 +90,8 @@ class CrossingInputs(NamedTuple):
     lead: Lead = NO_LEAD
     """Front axle of a truck with a tandem. Fixes, wheelbase, footprints and the last two signals
     are then those of the tandem, whose first axle is the front one."""
+    lead_footprint: Footprint = TYPICAL_FOOTPRINTS[0]
+    """Footprint of that front axle."""
 
 
 def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]:
@@ -166,6 +169,11 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
         values,
         np.zeros(0),
         tuple(allocate_buffers(crossing, theta.size, row) for _ in range(inputs.threads)),
+        front_axle=(
+            mismatch_spectra(inputs.lead_footprint, inputs.footprints[0])
+            if inputs.lead.ahead_m > 0.0
+            else None
+        ),
     )
     return problem, starting_point(problem, best)
 
@@ -221,6 +229,7 @@ def update_noise(
     noise = _without_lines(problem, noise)
     if differs:
         noise = without_joints(problem, y, noise)
+    noise = without_front_axle(problem._replace(mismatch=road), y, noise)
     truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
     changing = [*range(truck), *range(where.wheelbase, unknowns)]
     slope = np.zeros(unknowns)
@@ -266,9 +275,12 @@ def _with_lead_motion(problem: PosteriorProblem, y: FloatArray) -> PosteriorProb
 
 
 def replace_mismatch(
-    problem: PosteriorProblem, y: FloatArray, mismatch: Mismatch
+    problem: PosteriorProblem, y: FloatArray, mismatch: Mismatch, runs: float = 1.0
 ) -> PosteriorProblem:
-    """Return the problem with another mismatch in its noise at y (size,), gradient included."""
+    """Return the problem with another mismatch in its noise at y (size,), gradient included.
+
+    The noise by the axle ahead of a tandem has `runs` times its power.
+    """
     truck, density = noise_path_at(problem, y)
     noise = whitener(
         problem.rows,
@@ -278,8 +290,8 @@ def replace_mismatch(
         REDUCED_WEIGHT_FACTOR * problem.force,
         mismatch,
     )
-    noise = _without_lines(problem, noise)
-    return problem._replace(noise=without_joints(problem, y, noise))
+    noise = without_joints(problem, y, _without_lines(problem, noise))
+    return problem._replace(noise=without_front_axle(problem, y, noise, runs))
 
 
 def strongest_line_at_hz(problem: PosteriorProblem, y: FloatArray) -> float:

@@ -708,6 +708,9 @@ def evaluate_white(
     if noise.lines.size:
         white = out[:, : noise.reciprocal.size]
         white[:] = project_out(noise.lines, white)
+    if noise.low_rank.size:
+        white = out[:, : noise.reciprocal.size]
+        white[:] = project_out(noise.low_rank, white)
 
 
 def _in_threads(

@@ -33,6 +33,8 @@ class Whitener(NamedTuple):
     reciprocal: FloatArray  # (3 m,) of the diagonal
     lines: FloatArray = np.zeros((0, 0))
     """(3 m, w) orthonormal columns that are taken out of white rows, see `lines`."""
+    low_rank: FloatArray = np.zeros((0, 0))
+    """(3 m, k) columns C, after which w - C C'w are white, see `front_axle`."""
 
 
 def whitener(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, qr
 
 from pre_core import parameters
-from pre_core.crossing import posterior
+from pre_core.crossing import front_axle, posterior
 from pre_core.crossing.compliances import (
     MISMATCH_BIAS_SPREAD,
     marginal,
@@ -141,7 +141,7 @@ def likelihood(found: Optimum, *, with_bends: bool = True) -> CrossingLikelihood
     grid, inner = np.zeros(0), np.zeros(0, dtype=np.int64)
     differs = bool(problem.mismatch.level_m3.any())
     if differs:
-        problem = replace_mismatch(problem, y, _short_waves(problem.mismatch))
+        problem = replace_mismatch(problem, y, _short_waves(problem.mismatch), front_axle.RUNS)
         state = levenberg_marquardt.initial_state(lambda at: posterior.all_rows(problem, at), y)
         grid, inner = _knots(problem, y)
     bridge = where.bridge
@@ -357,8 +357,9 @@ def _white_knots(
         column[::RESIDUALS] = filtered
         solve(problem.noise.factor, problem.noise.reciprocal, column)
         out[:, k] = column
-    if problem.noise.lines.size:
-        out = project_out(problem.noise.lines, out.T).T
+    for columns in (problem.noise.lines, problem.noise.low_rank):
+        if columns.size:
+            out = project_out(columns, out.T).T
     return out
 
 

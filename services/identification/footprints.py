@@ -38,6 +38,18 @@ def footprints_of(
     return axles[0], axles[1]._replace(offset_m=vehicle.rear_axle_offset_m or 0.0)
 
 
+def lead_footprint_of(vehicle: Vehicle) -> Footprint:
+    """Return the footprint of the axle ahead of a tandem, beside that of the tandem's first one.
+
+    For a truck of two axles it is the typical front axle's.
+    """
+    tandem = vehicle.tandem
+    if tandem is None:
+        return TYPICAL_FOOTPRINTS[0]
+    lead, first = _of_axle(tandem.lead, "single"), _of_axle(tandem.first)
+    return lead._replace(offset_m=lead.offset_m - first.offset_m)
+
+
 def lead_of(vehicle: Vehicle) -> Lead:
     """Return the axle ahead of a tandem, `NO_LEAD` for a truck of two axles."""
     tandem = vehicle.tandem
@@ -55,9 +67,9 @@ def lead_of(vehicle: Vehicle) -> Lead:
     )
 
 
-def _of_axle(axle: Axle) -> Footprint:
-    """Return the footprint of one axle of a tandem; twin tyres where the site file has no value."""
-    kind = axle.tyres or ("single" if axle.twin_tyre_distance_m == 0.0 else "twin")
+def _of_axle(axle: Axle, usually: str = "twin") -> Footprint:
+    """Return the footprint of an axle, `usually` "twin" or "single" without declared tyres."""
+    kind = axle.tyres or ("single" if axle.twin_tyre_distance_m == 0.0 else usually)
     usual = TYRES[kind]
     distance, length = axle.twin_tyre_distance_m, axle.tyre_contact_length_m
     return Footprint(

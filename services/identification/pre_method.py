@@ -30,7 +30,7 @@ from services.finding.crossing_data import CrossingData
 from services.finding.placed import first_axle
 from services.identification.checks import stiffer_elements, undeclared_axles
 from services.identification.fit_reasons import reasons_of_fit
-from services.identification.footprints import footprints_of, lead_of
+from services.identification.footprints import footprints_of, lead_footprint_of, lead_of
 from services.identification.fusing import stored
 from services.identification.lane import lane_factor
 from services.identification.result_parts import (
@@ -130,6 +130,7 @@ def inputs_of(
         bridge.torsional_wave_speed_m_per_s,
         lane_factor(data),
         lead,
+        lead_footprint_of(vehicle),
     )
 
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
-from pre_core.crossing import posterior
+from pre_core.crossing import front_axle, posterior
 from pre_core.crossing.noise import no_force_noise
-from pre_core.crossing.off_bridge import off_bridge_residuals
-from pre_core.crossing.posterior import ChainageFixes, Priors
+from pre_core.crossing.off_bridge import off_bridge_residuals, surface_level_at
+from pre_core.crossing.posterior import ChainageFixes, PosteriorProblem, Priors
 from pre_core.crossing.preparation import (
     CrossingInputs,
     build_problem,
@@ -37,7 +37,7 @@ from pre_core.parameters import (
     table,
 )
 from pre_core.physics.surface import Footprint
-from pre_core.physics.tandem import Lead, friction_passage, shared_load
+from pre_core.physics.tandem import NO_LEAD, Lead, friction_passage, shared_load
 from pre_core.physics.vehicle import masses_above_axles
 from services.simulation.tandem_cases import TandemOptions, draw_tandem
 from services.simulation.two_sided import WideTruck, axle_row, body_row, static_axle_loads_n
@@ -68,6 +68,22 @@ def driven(friction: float = 0.08, equalised: bool = True) -> Driven:
     )
     run = case.runs[0]._replace(beside_m=0.0, change_m_per_s=0.3, forward=True)
     case = case._replace(sensors=sensors, runs=(run,), receiver=EXACT, is_one_road=True)
+    return Driven(case, drive_case(case, 0))
+
+
+@cache
+def driven_on_a_surface() -> Driven:
+    """Return a noise-free crossing with both axles of the tandem in one strip, beside the front's.
+
+    The front axle has single tyres and a wider track.
+    """
+    case = draw_tandem(3, TandemOptions(friction_share=0.0, offset_m=0.0))
+    sensors = tuple(
+        one._replace(gain_error=0.0, delay_s=0.0, bias_m_per_s2=0.0, noise_ug_per_rthz=0.0)
+        for one in case.sensors
+    )
+    run = case.runs[0]._replace(beside_m=0.0, change_m_per_s=0.3, forward=True)
+    case = case._replace(sensors=sensors, runs=(run,), receiver=EXACT)
     return Driven(case, drive_case(case, 0))
 
 
@@ -307,3 +323,68 @@ def test_sensor_noise_has_unit_variance_once_whitened(equalised: bool) -> None:
     for kind in (0,) if equalised else (0, 2):
         off = np.concatenate([white[before, kind], white[behind, kind]])
         assert np.mean(off**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / off.size))
+
+
+def on_a_surface(noise: float = 1.0) -> tuple[PosteriorProblem, np.ndarray]:
+    """Return the problem of `driven_on_a_surface` at the truth, for sensors of `noise` DENSITY."""
+    of = driven_on_a_surface()
+    lead, first, _ = (
+        Footprint(axle.tyre_width_m, axle.twin_distance_m, track_m=axle.track_m)
+        for axle in of.case.truck.axles
+    )
+    inputs = inputs_of(of)._replace(footprints=(first, first), lead_footprint=lead)
+    inputs = inputs._replace(density_m_per_s2_per_rthz=np.full(4, noise * DENSITY))
+    problem, y = build_problem(inputs)
+    none = np.zeros_like(problem.mismatch.level_m3)
+    for _ in range(2):
+        problem = update_noise(problem, y, mismatch=none)
+    return problem, y
+
+
+def test_front_axle_in_another_strip_is_noise_of_its_own() -> None:
+    problem, y = on_a_surface()
+    before, behind = off_bridge_residuals(problem, y)
+    on = slice(before.stop, behind.start)
+
+    def powers(one: PosteriorProblem) -> tuple[float, float]:
+        square = posterior.data_rows(one, y[None, :])[0, ::RESIDUALS] ** 2
+        return float(square[before].mean()), float(square[on].mean())
+
+    known = problem._replace(noise=problem.noise._replace(low_rank=np.zeros((0, 0))))
+    off_bridge, on_bridge = powers(known)
+    assert on_bridge > 2.0 * off_bridge
+    off_bridge, on_bridge = powers(problem)
+    assert on_bridge < off_bridge
+
+
+def test_noise_of_the_front_axle_is_white_once_whitened() -> None:
+    problem, y = on_a_surface(0.1)
+    crossing = problem.crossing
+    still = problem._replace(noise=problem.noise._replace(low_rank=np.zeros((0, 0))))
+    shapes = problem.front_axle
+    assert shapes is not None
+    motions = front_axle._motions(still, y, shapes, surface_level_at(still, y))
+    rng = np.random.default_rng(4)
+    base = posterior.data_rows(still, y[None, :])[0]
+    columns = problem.noise.low_rank
+    powers = []
+    for _ in range(200):
+        motion = crossing.lead_acceleration + motions @ rng.standard_normal(motions.shape[1])
+        moved = still._replace(crossing=crossing._replace(lead_acceleration=motion))
+        noise = posterior.data_rows(moved, y[None, :])[0] - base
+        noise += rng.standard_normal(noise.size)
+        left = noise - columns @ (columns.T @ noise)
+        # In the directions of the noise, of which the last ones are weak.
+        powers.append((np.linalg.qr(columns)[0].T @ left) ** 2)
+    power = np.mean(powers, axis=0)
+    assert power == pytest.approx(np.ones(power.size), abs=5.0 * np.sqrt(2.0 / len(powers)))
+
+
+def test_front_axle_counts_for_each_run_in_a_fusion() -> None:
+    problem, y = on_a_surface()
+    one = problem.noise.low_rank
+    many = front_axle.without_front_axle(problem, y, problem.noise, front_axle.RUNS).low_rank
+    assert many.shape[1] >= one.shape[1] > 10
+    assert np.sum(many**2) > 1.2 * np.sum(one**2)
+    problem, y = build_problem(inputs_of(driven())._replace(lead=NO_LEAD))
+    assert problem.front_axle is None
