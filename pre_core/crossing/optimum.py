@@ -15,6 +15,7 @@ If the result is a misfit because of hum, the search is repeated without the hum
 import numpy as np
 
 from pre_core.crossing.fit import (
+    FAR_OFF_CHI2,
     HOPELESS_CHI2,
     AbandonReason,
     Optimum,
@@ -22,6 +23,7 @@ from pre_core.crossing.fit import (
     fit_all,
     fit_stage,
     is_accepted,
+    is_better_misfit,
     resting_mode_indices,
 )
 from pre_core.crossing.noise import no_force_noise
@@ -66,7 +68,7 @@ _MAX_MOVES = 4
 """Limit of moves from an optimum to a neighbouring one."""
 _SAME_MINIMUM_M = 0.2
 """Distance within which offsets lead to one minimum."""
-_HOPELESS_CHI2 = (1000.0, HOPELESS_CHI2)
+_HOPELESS_CHI2 = (FAR_OFF_CHI2, HOPELESS_CHI2)
 """Values of chi2 above which no other offset is tried, after one candidate and after more. Of 70
 drawn fault-free crossings the first candidate was right in all; another one never reduced such a
 chi2 to a usable one."""
@@ -238,12 +240,17 @@ def _refine_likeliest(
         if not isinstance(found, Optimum):
             has_friction = found is AbandonReason.CLEAR_FRICTION
             break
+        is_no_better = (
+            best is not None
+            and bool(found.problem.force.any())
+            and not is_better_misfit(found.chi2_per_dof, best.chi2_per_dof)
+        )
         if best is None or found.chi2_per_dof < best.chi2_per_dof:
             best = found
         if is_accepted(best.problem, best.chi2_per_dof) or len(tried) == strategy.max_candidates:
             break
         hopeless = _HOPELESS_CHI2[min(len(tried), len(_HOPELESS_CHI2)) - 1]
-        if best.chi2_per_dof > hopeless or evaluations > max_evaluations:
+        if best.chi2_per_dof > hopeless or is_no_better or evaluations > max_evaluations:
             break
     if best is None:
         return _no_optimum(problem, y, evaluations, len(tried), has_friction=has_friction)

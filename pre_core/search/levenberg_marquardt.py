@@ -24,6 +24,8 @@ _GIVE_UP_DAMPING = 1e8
 _CONVERGED_STEP = 1e-9  # in logarithms
 _KEPT = 0.5
 """Smallest gain relative to the prediction of an updated Jacobian before it is recomputed."""
+_MISFIT_GAIN = 1e-3
+"""Gain relative to the objective that ends the search at a misfit."""
 _LARGEST_STEP = 1.0  # in logarithms: nothing changes by more than a factor of e in one step
 
 
@@ -267,9 +269,12 @@ def minimise(
     lower: FloatArray | None = None,
     *,
     is_followed: bool = False,
+    misfit: float = np.inf,
 ) -> SearchResult[LMState, LMInfo]:
     """Return the minimum near `start` (f,), reached when a step gains less than `enough`.
 
+    Where the mean square of the residuals exceeds `misfit`, a gain of less than a thousandth of the
+    objective also ends the search: its exact minimum is of no use.
     Where no step helps, forward differences have reached their rounding: a minimum too. With
     `is_followed` the Jacobian is computed at the start, and then only where updates (`_follow`)
     fail. A step that gains too little ends the search only with a fresh Jacobian. The Jacobian at
@@ -280,7 +285,9 @@ def minimise(
         following, info = (_follow if is_followed else descend)(rows, state, lower)
         if info.ending is Termination.STUCK:
             return following, info._replace(ending=Termination.CONVERGED)
-        if info.ending is None and state.objective - following.objective < enough:
+        is_misfit = following.objective > misfit * state.residual.size
+        least = max(enough, _MISFIT_GAIN * state.objective) if is_misfit else enough
+        if info.ending is None and state.objective - following.objective < least:
             if state.is_fresh:
                 return following, info._replace(ending=Termination.CONVERGED)
             if not following.is_fresh:

@@ -103,11 +103,14 @@ def test_a_fit_that_took_long_is_a_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ((26.0, 1.0), 1),
         ((24.0, 26.0, 1.0), 2),
-        ((24.0, 24.0, 15.0, 10.0, 5.0, 2.0), 6),
+        ((24.0, 22.0, 15.0, 10.0, 5.0, 2.0), 6),
+        ((24.0, 23.0, 1.0), 2),
+        ((2.2, 2.1, 1.0), 2),
+        ((2.2, 1.99, 1.98, 1.98, 1.97, 1.97), 6),
         ((1.9, 1.9, 1.9, 1.9, 1.9, 1.9), 6),
     ],
 )
-def test_noise_rounds_end_at_a_hopeless_misfit(
+def test_noise_rounds_end_at_a_misfit_that_stays(
     chi2: tuple[float, ...], rounds: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     left = iter(chi2)
@@ -133,3 +136,38 @@ def test_a_hopeless_fit_is_not_repeated_with_free_ends(monkeypatch: pytest.Monke
         restrained = found(chi2, 1)._replace(state=SimpleNamespace(y=np.ones(2)))
         better, evaluations = optimum._with_free_ends(restrained, strategy)
         assert (better.chi2_per_dof, evaluations) == (1.0 if used else chi2, used)
+
+
+@pytest.mark.parametrize(
+    ("chi2", "force", "starts"),
+    [
+        ((201.0, 1.0), 1.0, 1),
+        ((199.0, 26.0, 1.0), 1.0, 2),
+        ((8.0, 7.7, 1.0), 1.0, 2),
+        ((8.0, 9.0, 1.0), 1.0, 2),
+        ((8.0, 7.7, 1.0), 0.0, 3),
+        ((8.0, 7.5, 7.2, 1.0), 1.0, 3),
+        ((1.9, 1.9, 1.9, 1.9), 1.0, 4),
+    ],
+)
+def test_offsets_end_where_another_one_fits_no_better(
+    chi2: tuple[float, ...], force: float, starts: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem: Any = SimpleNamespace(
+        mismatch=SimpleNamespace(level_m3=np.zeros(1)), force=np.array([force])
+    )
+    left = iter(chi2)
+    places = [walk.Placement(0.0, float(n), np.zeros(1), np.zeros(1, int)) for n in range(4)]
+    monkeypatch.setattr(optimum, "_find_truck", lambda *_: (problem, np.zeros(1), 0))
+    monkeypatch.setattr(optimum, "noise_power_ratio", lambda *_: 1.0)
+    monkeypatch.setattr(optimum, "_has_clear_mismatch", lambda *_: False)
+    monkeypatch.setattr(optimum, "scan_offsets", lambda *_: (places, 0))
+    monkeypatch.setattr(optimum, "shifted_to", lambda _, y, place: y)
+    monkeypatch.setattr(optimum, "is_accepted", lambda _, value: value < 1.5)
+    monkeypatch.setattr(optimum, "_with_free_ends", lambda best, _: (best, 0))
+    monkeypatch.setattr(
+        optimum, "fit_all", lambda *_: (found(next(left), 1)._replace(problem=problem), 1)
+    )
+    strategy = fit.SearchStrategy(0, False, 4, False)
+    best = optimum._refine_likeliest(problem, np.zeros(1), strategy, lambda *_: None, 1000)
+    assert (best.starts, best.chi2_per_dof) == (starts, min(chi2[:starts]))

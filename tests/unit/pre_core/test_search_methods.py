@@ -448,6 +448,23 @@ def test_a_descent_ends_with_the_first_step_that_gains_too_little() -> None:
     assert gains[-1] < 1.0
 
 
+@pytest.mark.parametrize("is_followed", [False, True])
+def test_a_descent_to_a_misfit_ends_where_a_thousandth_is_gained(is_followed: bool) -> None:
+    def rows(y: np.ndarray) -> np.ndarray:
+        return np.column_stack([np.sinh(y[:, 0]), np.full(y.shape[0], 100.0)])
+
+    def steps(misfit: float) -> int:
+        found = levenberg_marquardt.minimise(
+            rows, np.array([3.0]), 200, 1e-9, is_followed=is_followed, misfit=misfit
+        )
+        assert found.ending is Termination.CONVERGED
+        return len(found.infos)
+
+    exact, rough = steps(np.inf), steps(4999.0)
+    assert steps(6000.0) == exact
+    assert rough < exact
+
+
 def test_the_random_walk_begins_in_the_papers_prior(window: PaperWindow) -> None:
     bound = random_walk.problem(window, NOMINAL, FREE, 0)
     ratios = random_walk.init(bound, 2000).ratios
