@@ -222,10 +222,8 @@ def _refine_likeliest(
         return _no_optimum(problem, y, evaluations, 0, differs=True)
     report("finding the bridge", 0.2)
     places, used = scan_offsets(problem, y, strategy)
-    evaluations += used
-    problem = problem._replace(front_axle=front_axle)
-    best: Optimum | None = None
-    has_friction = False
+    problem, evaluations = problem._replace(front_axle=front_axle), evaluations + used
+    best, has_friction = None, False
     tried: list[float] = []
     for place in places:
         if any(abs(place.shift_m - other) < _SAME_MINIMUM_M for other in tried):
@@ -240,17 +238,11 @@ def _refine_likeliest(
         if not isinstance(found, Optimum):
             has_friction = found is AbandonReason.CLEAR_FRICTION
             break
-        is_no_better = (
-            best is not None
-            and bool(found.problem.force.any())
-            and not is_better_misfit(found.chi2_per_dof, best.chi2_per_dof)
-        )
+        last_chi2 = np.inf if best is None else best.chi2_per_dof
         if best is None or found.chi2_per_dof < best.chi2_per_dof:
             best = found
-        if is_accepted(best.problem, best.chi2_per_dof) or len(tried) == strategy.max_candidates:
-            break
-        hopeless = _HOPELESS_CHI2[min(len(tried), len(_HOPELESS_CHI2)) - 1]
-        if best.chi2_per_dof > hopeless or is_no_better or evaluations > max_evaluations:
+        is_last = len(tried) == strategy.max_candidates or evaluations > max_evaluations
+        if is_last or _is_last_offset(best, found, last_chi2, len(tried)):
             break
     if best is None:
         return _no_optimum(problem, y, evaluations, len(tried), has_friction=has_friction)
@@ -262,6 +254,18 @@ def _refine_likeliest(
         stopped_by_friction=has_friction,
         noise_power=power * _excess_noise_power(best),
     )
+
+
+def _is_last_offset(best: Optimum, found: Optimum, last_chi2: float, tried: int) -> bool:
+    """Return whether no other offset is worth a try after `found`, the last of `tried`.
+
+    `last_chi2` is that of the best one before.
+    """
+    if is_accepted(best.problem, best.chi2_per_dof):
+        return True
+    if found.problem.force.any() and not is_better_misfit(found.chi2_per_dof, last_chi2):
+        return True
+    return best.chi2_per_dof > _HOPELESS_CHI2[min(tried, len(_HOPELESS_CHI2)) - 1]
 
 
 def _find_truck(

@@ -50,7 +50,7 @@ from pre_core.physics.beam_basis import beam_basis, change_basis
 from pre_core.physics.bridge import FloatArray
 from pre_core.physics.surface import TYPICAL_FOOTPRINTS, Footprint
 from pre_core.physics.tandem import NO_LEAD, Lead, shared_load
-from pre_core.physics.torsion import NO_TORSION, torsion_basis
+from pre_core.physics.torsion import NO_TORSION, TorsionBasis, torsion_basis
 
 _KNOT_S = 0.4
 """Knot spacing of the trajectory: a driver changes the speed more slowly."""
@@ -114,16 +114,6 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
     travel = front if inputs.direction > 0 else inputs.span_m - front
     wheelbase = inputs.priors.wheelbase_m
     first = int(np.searchsorted(travel - wheelbase, travel[0] + _MARGIN_M))
-    torsion = NO_TORSION
-    if inputs.priors.estimated[TORSION]:
-        if not inputs.torsional_wave_speed_m_per_s > 0.0:
-            raise ValueError("torsion is estimated, so its waves need a speed")
-        torsion = torsion_basis(
-            basis.lengths_m,
-            tuple(inputs.parts * node for node in inputs.interior_supports),
-            inputs.torsional_wave_speed_m_per_s,
-            inputs.lane_factor,
-        )
     crossing = GriddedCrossing(
         model.step_s,
         model.signals,
@@ -140,7 +130,7 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
         step_table(),
         False,
         0,
-        torsion,
+        _torsion(inputs, basis.lengths_m),
     )
     crossing = crossing._replace(lead=inputs.lead, lead_acceleration=np.zeros(n))
     crossing = crossing._replace(swing_sample=swing_sample(crossing, front))
@@ -176,6 +166,20 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
         ),
     )
     return problem, starting_point(problem, best)
+
+
+def _torsion(inputs: CrossingInputs, lengths_m: FloatArray) -> TorsionBasis:
+    """Return the torsion of a deck of finite elements of these lengths (e,), if it is estimated."""
+    if not inputs.priors.estimated[TORSION]:
+        return NO_TORSION
+    if not inputs.torsional_wave_speed_m_per_s > 0.0:
+        raise ValueError("torsion is estimated, so its waves need a speed")
+    return torsion_basis(
+        lengths_m,
+        tuple(inputs.parts * node for node in inputs.interior_supports),
+        inputs.torsional_wave_speed_m_per_s,
+        inputs.lane_factor,
+    )
 
 
 def swing_sample(crossing: GriddedCrossing, front: FloatArray) -> int:
@@ -226,10 +230,7 @@ def update_noise(
     residual_force = REDUCED_WEIGHT_FACTOR * force
     profile_noise = road if differs else None
     noise = whitener(problem.rows, count, trucks[0], density[0], residual_force, profile_noise)
-    noise = _without_lines(problem, noise)
-    if differs:
-        noise = without_joints(problem, y, noise)
-    noise = without_front_axle(problem._replace(mismatch=road), y, noise)
+    noise = _with_local_noise(problem._replace(mismatch=road), y, noise)
     truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
     changing = [*range(truck), *range(where.wheelbase, unknowns)]
     slope = np.zeros(unknowns)
@@ -290,8 +291,17 @@ def replace_mismatch(
         REDUCED_WEIGHT_FACTOR * problem.force,
         mismatch,
     )
-    noise = without_joints(problem, y, _without_lines(problem, noise))
-    return problem._replace(noise=without_front_axle(problem, y, noise, runs))
+    return problem._replace(noise=_with_local_noise(problem, y, noise, runs))
+
+
+def _with_local_noise(
+    problem: PosteriorProblem, y: FloatArray, noise: Whitener, runs: float = 1.0
+) -> Whitener:
+    """Return the whitener without lines and joints, and with the noise by a tandem's front axle."""
+    noise = _without_lines(problem, noise)
+    if problem.mismatch.level_m3.any():
+        noise = without_joints(problem, y, noise)
+    return without_front_axle(problem, y, noise, runs)
 
 
 def strongest_line_at_hz(problem: PosteriorProblem, y: FloatArray) -> float:

@@ -20,13 +20,12 @@ from numpy.typing import NDArray
 
 from pre_core.crossing import tandem
 from pre_core.crossing.channels import A_1, A_2, A_3, A, V, Z
-from pre_core.crossing.lines import project_out
 from pre_core.crossing.rows import RESIDUALS, RowFilter, row_count
 from pre_core.crossing.step_tables import PHASES as _PHASES
 from pre_core.crossing.step_tables import SINC_TAPS as _SINC_TAPS
 from pre_core.crossing.step_tables import STEP_REACH as _STEP_REACH
 from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_SPRING_N_PER_M
-from pre_core.crossing.whitening import Whitener, whiten_into
+from pre_core.crossing.whitening import Whitener, project_out_noise, whiten_into
 from pre_core.kernels.lanes import LANES, kernel, summing
 from pre_core.parameters import (
     C_S1,
@@ -705,12 +704,9 @@ def evaluate_white(
         _evaluate(crossing, rows, noise, work, points, begin, stop, _WHITE, out)
 
     _in_threads(part, works, out.shape[0])
-    if noise.lines.size:
+    if noise.lines.size or noise.low_rank.size:
         white = out[:, : noise.reciprocal.size]
-        white[:] = project_out(noise.lines, white)
-    if noise.low_rank.size:
-        white = out[:, : noise.reciprocal.size]
-        white[:] = project_out(noise.low_rank, white)
+        white[:] = project_out_noise(noise, white)
 
 
 def _in_threads(

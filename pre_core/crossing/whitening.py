@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.crossing import mismatch as _mismatch
+from pre_core.crossing.lines import project_out
 from pre_core.crossing.mismatch import Mismatch
 from pre_core.crossing.noise import NoisePath, noise_spectrum
 from pre_core.crossing.rows import RESIDUALS, RowFilter, filter_rows, phases, row_count
@@ -35,6 +36,14 @@ class Whitener(NamedTuple):
     """(3 m, w) orthonormal columns that are taken out of white rows, see `lines`."""
     low_rank: FloatArray = np.zeros((0, 0))
     """(3 m, k) columns C, after which w - C C'w are white, see `front_axle`."""
+
+
+def project_out_noise(noise: Whitener, white: FloatArray) -> FloatArray:
+    """Return white rows (k, 3 m) without the removed lines, and whitened for noise of low rank."""
+    for columns in (noise.lines, noise.low_rank):
+        if columns.size:
+            white = project_out(columns, white)
+    return white
 
 
 def whitener(

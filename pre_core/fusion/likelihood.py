@@ -31,14 +31,13 @@ from pre_core.crossing.compliances import (
     without_priors,
 )
 from pre_core.crossing.fit import Optimum
-from pre_core.crossing.lines import project_out
 from pre_core.crossing.mismatch import CORRELATION_LENGTH_M, Mismatch, long_wave_power
 from pre_core.crossing.off_bridge import off_bridge_residuals
 from pre_core.crossing.preparation import replace_mismatch
 from pre_core.crossing.residuals import EvaluationPoints, GriddedCrossing, evaluate
 from pre_core.crossing.rows import RESIDUALS, filter_rows, row_count
 from pre_core.crossing.splines import basis
-from pre_core.crossing.whitening import solve
+from pre_core.crossing.whitening import project_out_noise, solve
 from pre_core.fusion.curvature import CurvatureTerms, curvature_terms
 from pre_core.fusion.curvature import linearise_with_curvature as straightened_about
 from pre_core.physics.simulate import rear_position_m
@@ -357,10 +356,7 @@ def _white_knots(
         column[::RESIDUALS] = filtered
         solve(problem.noise.factor, problem.noise.reciprocal, column)
         out[:, k] = column
-    for columns in (problem.noise.lines, problem.noise.low_rank):
-        if columns.size:
-            out = project_out(columns, out.T).T
-    return out
+    return project_out_noise(problem.noise, out.T).T
 
 
 def _off_bridge(found: Optimum) -> OffBridgeMismatch:

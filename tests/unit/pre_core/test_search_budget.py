@@ -154,8 +154,9 @@ def test_offsets_end_where_another_one_fits_no_better(
     chi2: tuple[float, ...], force: float, starts: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem: Any = SimpleNamespace(
-        mismatch=SimpleNamespace(level_m3=np.zeros(1)), force=np.array([force])
+        mismatch=SimpleNamespace(level_m3=np.zeros(1)), force=np.array([force]), front_axle=None
     )
+    problem._replace = lambda **_: problem
     left = iter(chi2)
     places = [walk.Placement(0.0, float(n), np.zeros(1), np.zeros(1, int)) for n in range(4)]
     monkeypatch.setattr(optimum, "_find_truck", lambda *_: (problem, np.zeros(1), 0))
