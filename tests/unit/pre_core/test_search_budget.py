@@ -2,10 +2,11 @@
 
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pre_core.crossing import fit, optimum, walk
 from pre_core.crossing.fit import Optimum
@@ -172,3 +173,38 @@ def test_offsets_end_where_another_one_fits_no_better(
     strategy = fit.SearchStrategy(0, False, 4, False)
     best = optimum._refine_likeliest(problem, np.zeros(1), strategy, lambda *_: None, 1000)
     assert (best.starts, best.chi2_per_dof) == (starts, min(chi2[:starts]))
+
+
+class _Problem(NamedTuple):
+    front_axle: object
+    force: NDArray[np.float64]
+
+
+def test_offsets_are_scanned_as_if_the_front_axle_were_known(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem: Any = _Problem("its spectra", np.zeros(1))
+    seen: list[object] = []
+
+    def find_truck(problem: Any, y: Any, *_: Any) -> tuple[Any, Any, int]:
+        seen.append(problem.front_axle)
+        return problem, y, 0
+
+    def scan(problem: Any, y: Any, *_: Any) -> tuple[list[walk.Placement], int]:
+        seen.append(problem.front_axle)
+        return [walk.Placement(0.0, 0.0, np.zeros(1), np.zeros(1, int))], 0
+
+    def fit_there(problem: Any, *_: Any) -> tuple[Any, int]:
+        seen.append(problem.front_axle)
+        return fit.AbandonReason.CLEAR_FRICTION, 0
+
+    monkeypatch.setattr(optimum, "_find_truck", find_truck)
+    monkeypatch.setattr(optimum, "noise_power_ratio", lambda *_: 1.0)
+    monkeypatch.setattr(optimum, "_has_clear_mismatch", lambda *_: False)
+    monkeypatch.setattr(optimum, "scan_offsets", scan)
+    monkeypatch.setattr(optimum, "shifted_to", lambda _, y, place: y)
+    monkeypatch.setattr(optimum, "fit_all", fit_there)
+    monkeypatch.setattr(optimum, "_no_optimum", lambda *_, **__: found(0.0, 1))
+    strategy = fit.SearchStrategy(0, False, 4, False)
+    optimum._refine_likeliest(problem, np.zeros(1), strategy, lambda *_: None, 1000)
+    assert seen == [None, None, "its spectra"]
