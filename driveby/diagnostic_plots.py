@@ -49,10 +49,9 @@ def plot_posterior(solution: Solution, names: Sequence[str] | None = None) -> Fi
 
     Raise InputError for an unknown name or a crossing without draws.
     """
-    chosen = _chosen(solution, names)
     with matplotlib.rc_context(STYLE):
-        figure, panels = _panels(len(chosen), 2.0)
-        for axes, name in zip(panels, chosen, strict=True):
+        figure, panels = _panels(_chosen(solution, names), 2.0)
+        for name, axes in panels:
             found = solution.value[name]
             draws = solution.draws[name].ravel()
             if found.prior is not None:
@@ -70,10 +69,9 @@ def plot_posterior(solution: Solution, names: Sequence[str] | None = None) -> Fi
             for limit in (found.q025, found.q975):
                 axes.axvline(limit, color="0.3", lw=0.8, ls="--")
             axes.set_xlim(found.mean - _SHOWN * found.std, found.mean + _SHOWN * found.std)
-            axes.set_title(name)
             axes.set_xlabel(found.unit)
             axes.set_yticks([])
-        panels[0].legend(fontsize="small")
+        figure.axes[0].legend(fontsize="small")
     return figure
 
 
@@ -82,13 +80,11 @@ def plot_chains(solution: Solution, names: Sequence[str] | None = None) -> Figur
 
     Raise InputError for an unknown name or a crossing without draws.
     """
-    chosen = _chosen(solution, names)
     with matplotlib.rc_context(STYLE):
-        figure, panels = _panels(len(chosen), 1.8)
-        for axes, name in zip(panels, chosen, strict=True):
+        figure, panels = _panels(_chosen(solution, names), 1.8)
+        for name, axes in panels:
             for chain in solution.draws[name]:
                 axes.plot(chain, lw=0.4, alpha=0.7)
-            axes.set_title(name)
             axes.set_xlabel("draw")
             axes.set_ylabel(solution.value[name].unit)
     return figure
@@ -109,8 +105,14 @@ def _chosen(solution: Solution, names: Sequence[str] | None) -> list[str]:
     return chosen
 
 
-def _panels(count: int, height_in: float) -> tuple[Figure, list[Axes]]:
-    columns = min(count, _COLUMNS)
-    rows = -(-count // columns)
+def _panels(names: Sequence[str], height_in: float) -> tuple[Figure, list[tuple[str, Axes]]]:
+    """Return a figure and its panels, one below the name of each parameter."""
+    columns = min(len(names), _COLUMNS)
+    rows = -(-len(names) // columns)
     figure = Figure(figsize=(2.6 * columns, height_in * rows + 0.2), layout="constrained")
-    return figure, [figure.add_subplot(rows, columns, k + 1) for k in range(count)]
+    panels = []
+    for number, name in enumerate(names, 1):
+        axes = figure.add_subplot(rows, columns, number)
+        axes.set_title(name)
+        panels.append((name, axes))
+    return figure, panels

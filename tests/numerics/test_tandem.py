@@ -61,14 +61,8 @@ class Driven(NamedTuple):
 
 @cache
 def driven(friction: float = 0.08, equalised: bool = True) -> Driven:
-    case = draw_tandem(3, TandemOptions(friction_share=friction, equalised=equalised))
-    sensors = tuple(
-        one._replace(gain_error=0.0, delay_s=0.0, bias_m_per_s2=0.0, noise_ug_per_rthz=0.0)
-        for one in case.sensors
-    )
-    run = case.runs[0]._replace(beside_m=0.0, change_m_per_s=0.3, forward=True)
-    case = case._replace(sensors=sensors, runs=(run,), receiver=EXACT, is_one_road=True)
-    return Driven(case, drive_case(case, 0))
+    options = TandemOptions(friction_share=friction, equalised=equalised)
+    return noise_free(options, is_one_road=True)
 
 
 @cache
@@ -77,13 +71,17 @@ def driven_on_a_surface() -> Driven:
 
     The front axle has single tyres and a wider track.
     """
-    case = draw_tandem(3, TandemOptions(friction_share=0.0, offset_m=0.0))
+    return noise_free(TandemOptions(friction_share=0.0, offset_m=0.0), is_one_road=False)
+
+
+def noise_free(options: TandemOptions, *, is_one_road: bool) -> Driven:
+    case = draw_tandem(3, options)
     sensors = tuple(
         one._replace(gain_error=0.0, delay_s=0.0, bias_m_per_s2=0.0, noise_ug_per_rthz=0.0)
         for one in case.sensors
     )
     run = case.runs[0]._replace(beside_m=0.0, change_m_per_s=0.3, forward=True)
-    case = case._replace(sensors=sensors, runs=(run,), receiver=EXACT)
+    case = case._replace(sensors=sensors, runs=(run,), receiver=EXACT, is_one_road=is_one_road)
     return Driven(case, drive_case(case, 0))
 
 
@@ -341,6 +339,10 @@ def on_a_surface(noise: float = 1.0) -> tuple[PosteriorProblem, np.ndarray]:
     return problem, y
 
 
+def with_known_front_axle(problem: PosteriorProblem) -> PosteriorProblem:
+    return problem._replace(noise=problem.noise._replace(low_rank=np.zeros((0, 0))))
+
+
 def test_front_axle_in_another_strip_is_noise_of_its_own() -> None:
     problem, y = on_a_surface()
     before, behind = off_bridge_residuals(problem, y)
@@ -350,8 +352,7 @@ def test_front_axle_in_another_strip_is_noise_of_its_own() -> None:
         square = posterior.data_rows(one, y[None, :])[0, ::RESIDUALS] ** 2
         return float(square[before].mean()), float(square[on].mean())
 
-    known = problem._replace(noise=problem.noise._replace(low_rank=np.zeros((0, 0))))
-    off_bridge, on_bridge = powers(known)
+    off_bridge, on_bridge = powers(with_known_front_axle(problem))
     assert on_bridge > 2.0 * off_bridge
     off_bridge, on_bridge = powers(problem)
     assert on_bridge < off_bridge
@@ -360,7 +361,7 @@ def test_front_axle_in_another_strip_is_noise_of_its_own() -> None:
 def test_noise_of_the_front_axle_is_white_once_whitened() -> None:
     problem, y = on_a_surface(0.1)
     crossing = problem.crossing
-    still = problem._replace(noise=problem.noise._replace(low_rank=np.zeros((0, 0))))
+    still = with_known_front_axle(problem)
     shapes = problem.front_axle
     assert shapes is not None
     motions = front_axle._motions(still, y, shapes, surface_level_at(still, y))

@@ -425,22 +425,31 @@ def test_a_browser_that_prints_nothing_is_a_failure_with_the_page_left(
     assert not (tmp_path / "r.pdf").exists()
 
 
+@pytest.fixture
+def browser() -> str:
+    """The browser that prints; without one the test is left out."""
+    try:
+        return pdf.find_browser()
+    except FailureError as error:
+        pytest.skip(str(error))
+
+
+def number_of_sheets(printed: Path) -> int:
+    return len(re.findall(rb"/Type\s*/Page\b", printed.read_bytes()))
+
+
 @pytest.mark.process
+@pytest.mark.usefixtures("browser")
 def test_on_paper_a_bridge_of_one_crossing_has_two_pages(
     capsys: pytest.CaptureFixture[str], written: tuple[Path, Path], tmp_path: Path
 ) -> None:
     """The first page holds all that an owner needs."""
-    try:
-        pdf.find_browser()
-    except Exception as error:
-        pytest.skip(str(error))
     found, site = written
     code, out, _ = run(capsys, "report", found, "--site", site, "-o", tmp_path / "r.html", "--pdf")
     assert code == 0
     assert out.splitlines()[-1] == str(tmp_path / "r.pdf")
-    printed = (tmp_path / "r.pdf").read_bytes()
-    assert printed.startswith(b"%PDF")
-    assert len(re.findall(rb"/Type\s*/Page\b", printed)) == 2
+    assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")
+    assert number_of_sheets(tmp_path / "r.pdf") == 2
 
 
 def fused(
@@ -477,13 +486,9 @@ def without_weak(site: Site, spreads: list[float]) -> Results:
 
 
 def test_on_paper_all_measures_and_the_signature_are_on_the_sheet_of_the_crossings(
-    site: Site, tmp_path: Path
+    site: Site, tmp_path: Path, browser: str
 ) -> None:
     """The line for the signature was alone on the last sheet."""
-    try:
-        browser = pdf.find_browser()
-    except FailureError as error:
-        pytest.skip(str(error))
     content = fused(site, KNOWN).model_dump(mode="json")
     for one in content["crossings"]:
         one["derived"]["probability_torsion"] = 0.03
@@ -492,18 +497,13 @@ def test_on_paper_all_measures_and_the_signature_are_on_the_sheet_of_the_crossin
     found = Results.model_validate(content)
     html.write_text(page(bridge_reports([(Path("drive.json"), found, site)], None)))
     pdf.write_pdf(html, tmp_path / "r.pdf", browser)
-    printed = (tmp_path / "r.pdf").read_bytes()
-    assert len(re.findall(rb"/Type\s*/Page\b", printed)) == 2
+    assert number_of_sheets(tmp_path / "r.pdf") == 2
 
 
 def test_on_paper_the_first_page_of_an_end_that_is_weak_is_one_sheet(
-    site: Site, tmp_path: Path
+    site: Site, tmp_path: Path, browser: str
 ) -> None:
     """The longest: fused, and a bearing to be looked at. Then a sheet for all crossings."""
-    try:
-        browser = pdf.find_browser()
-    except FailureError as error:
-        pytest.skip(str(error))
     nominal = site.bridges[0].nominal_flexural_rigidity_nm2
     state = {}
     for name, value in (("EI_4", 0.98 * nominal[3]), ("EI_7", 0.5 * nominal[6])):
@@ -515,8 +515,7 @@ def test_on_paper_the_first_page_of_an_end_that_is_weak_is_one_sheet(
     html.write_text(page(reports))
     assert "at the bearing there" in html.read_text()
     pdf.write_pdf(html, tmp_path / "r.pdf", browser)
-    printed = (tmp_path / "r.pdf").read_bytes()
-    assert len(re.findall(rb"/Type\s*/Page\b", printed)) == 2
+    assert number_of_sheets(tmp_path / "r.pdf") == 2
 
 
 def test_fused_crossings_are_listed_with_their_agreement(site: Site) -> None:
