@@ -57,8 +57,8 @@ SHOTS = (
     Shot("view-recording", "recording.rrd", ("Recording",), None),
     Shot("view-bridge", "good.rrd", ("Bridge",), 15_000),
     Shot("view-crossing", "good.rrd", ("2026-01-01",), 15_000),
-    Shot("view-posterior", "good.rrd", ("2026-01-01", "Posterior against", "Map"), 15_000),
-    Shot("view-left-over", "suspect.rrd", ("2026-01-01", "Residuals by", "Map"), 15_000),
+    Shot("view-posterior", "good.rrd", ("2026-01-01", "Posterior and", "Map"), 15_000),
+    Shot("view-left-over", "suspect.rrd", ("2026-01-01", "Residuals", "Map"), 15_000),
     Shot("view-suspect", "suspect.rrd", ("2026-01-01",), 9_000),
     Shot("view-rejected", "rejected.rrd", ("2026-01-01",), None),
 )

@@ -115,7 +115,7 @@ def _crossing_layout(
             _plot(f"{root}/road_difference", f"{_difference_title(crossing)} (mm)"),
             *plots,
         ]
-    coloured = crossing.rigidity_nm2 is not None
+    coloured = crossing.rigidity_nm2 is not None and not is_doubtful(crossing)
     columns: list[tuple[rrb.Container | rrb.View, int]] = [
         (_verdict_and_place(root, bridge, coloured=coloured), 5)
     ]
@@ -123,7 +123,7 @@ def _crossing_layout(
         columns.append((_rigidity_layout(root, crossing), 6))
     evidence: list[rrb.Container | rrb.View] = []
     if plots:
-        evidence.append(rrb.Vertical(*plots, name="Road and signals"))
+        evidence.append(rrb.Vertical(*plots, name="Signals"))
     if crossing.interval_has_meaning and prior_posterior_rows(crossing.parameters):
         evidence.append(_prior_posterior_view(root, crossing))
     if crossing.residuals is not None:
@@ -165,7 +165,7 @@ def _overview_layout(bridge: BridgeView, on_map: BridgeOnMap | None) -> rrb.Cont
     )
     side = rrb.Vertical(
         rrb.TextDocumentView(origin=f"{bridge_root(bridge)}/finding", name="Finding"),
-        bridge_places(on_map, coloured=bridge.estimate is not None),
+        bridge_places(on_map, coloured=bridge.estimate is not None and not bridge.is_doubtful),
     )
     name = f"Bridge {bridge.owner_id or bridge.bridge}"
     return rrb.Horizontal(picture, side, column_shares=[5, 2], name=name)
@@ -189,7 +189,7 @@ def _rigidity_layout(root: str, crossing: CrossingView) -> rrb.Container:
         ),
         rrb.BarChartView(
             origin=f"{root}/rigidity",
-            name=f"{doubt}EI (GN·m²) over chainage (m)",
+            name=f"{doubt}EI (GN·m²) over m",
             plot_legend=rrb.PlotLegend(visible=False),
         ),
         active_tab=0,
@@ -212,7 +212,7 @@ def _prior_posterior_view(root: str, crossing: CrossingView) -> rrb.View:
     rows = len(prior_posterior_rows(crossing.parameters))
     return rrb.Spatial2DView(
         origin=f"{root}/learned",
-        name="Posterior against prior (grey)",
+        name="Posterior and prior",
         background=STRIP_PAPER,
         visual_bounds=rrb.VisualBounds2D(
             x_range=(-3.6, 4.2),
@@ -225,7 +225,7 @@ def _residuals_view(root: str) -> rrb.View:
     x_range, y_range = RESIDUALS_BOUNDS
     return rrb.Spatial2DView(
         origin=f"{root}/residuals",
-        name="Residuals by frequency band",
+        name="Residuals",
         background=STRIP_PAPER,
         visual_bounds=rrb.VisualBounds2D(x_range=x_range, y_range=y_range),
     )
@@ -371,6 +371,4 @@ def bridge_places(
 
 
 def _map(*contents: str, zoom: float | None = None) -> rrb.View:
-    return rrb.MapView(
-        origin="/", contents=list(contents), name="Map (tiles need a network)", zoom=zoom
-    )
+    return rrb.MapView(origin="/", contents=list(contents), name="Map", zoom=zoom)

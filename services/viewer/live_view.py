@@ -62,8 +62,8 @@ from services.viewer.live_parts import (
 from services.viewer.live_trucks import LiveTruck
 from services.viewer.rerun_crossing import log_rigidity
 from services.viewer.rerun_parts import (
-    channel_colour,
     columns_of,
+    log_channel,
     log_line,
     send_scalars,
 )
@@ -176,7 +176,7 @@ class LiveView:
         for channel in batch.channels.keys() - truck.channels:
             truck.channels.add(channel)
             entity = f"vehicle/{vehicle}/acceleration/{channel}"
-            log_line(self._recording, entity, channel.replace("_", " "), channel_colour(channel))
+            log_channel(self._recording, entity, channel)
             self._layout_is_old = True
         truck.batches.append(batch)
 

@@ -33,8 +33,8 @@ from services.viewer.rerun_parts import (
     IntArray,
     RerunStream,
     chainage_column,
-    channel_colour,
     columns_of,
+    log_channel,
     log_labels,
     log_line,
     log_markdown,
@@ -117,7 +117,7 @@ def log_acceleration(
     for channel, (time_ns, samples) in channels.items():
         inside = (time_ns >= first_ns) & (time_ns <= last_ns)
         entity = f"{root}/acceleration/{channel}"
-        log_line(recording, entity, channel.replace("_", " "), channel_colour(channel))
+        log_channel(recording, entity, channel)
         send_scalars(
             recording,
             entity,
@@ -140,7 +140,7 @@ def _log_ends(recording: RerunStream, entity: str, crossing: CrossingSpan) -> No
             colors=[rgb(MUTED)],
             markers=["up"],
             marker_sizes=[6.0],
-            names="on, off the bridge",
+            names="on, off",
         ),
         static=True,
     )

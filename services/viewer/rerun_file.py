@@ -46,8 +46,7 @@ from services.viewer.rerun_crossing import (
 )
 from services.viewer.rerun_parts import (
     IntArray,
-    channel_colour,
-    log_line,
+    log_channel,
     log_markdown,
     send_scalars,
 )
@@ -172,7 +171,7 @@ def _log_accelerations(
             entity = f"vehicle/{vehicle}/acceleration/{channel}"
             if channel not in named:
                 named.add(channel)
-                log_line(recording, entity, channel.replace("_", " "), channel_colour(channel))
+                log_channel(recording, entity, channel)
             known = piece[0].channels.get(channel) if first else None
             sent = 0 if known is None else known.samples.size
             send_scalars(recording, entity, samples[sent:], time_ns=time_ns[sent:])

@@ -53,6 +53,13 @@ def channel_colour(channel: str) -> str:
     return _OTHER_CHANNELS[sum(channel.encode()) % len(_OTHER_CHANNELS)]
 
 
+def log_channel(recording: RerunStream, entity: str, channel: str) -> None:
+    """Define the line of a channel, named shortly: the plot's title has its part of the truck."""
+    part, _, place = channel.partition("_")
+    name = place if part in ("sprung", "unsprung") and place else channel
+    log_line(recording, entity, name.replace("_", " "), channel_colour(channel))
+
+
 def rgb(colour: str) -> Rgb:
     """Return red, green and blue, 0 to 255, of #RRGGBB."""
     red, green, blue = bytes.fromhex(colour.removeprefix("#"))
