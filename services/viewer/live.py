@@ -65,7 +65,7 @@ def live_command(asked: ViewSettings, print_line: Callable[[str], None]) -> int:
     _check_address(address)
     chosen = _free_port(address, asked.port)
     if show is not None:
-        prepare_viewer()
+        prepare_viewer(window=show == "window")
     with (
         stopped_by_signals(leave_at_once) as stop,
         rr.RecordingStream(APPLICATION) as recording,

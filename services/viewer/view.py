@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import os
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -51,6 +53,8 @@ from services.viewer.residuals import residual_cells
 from services.viewer.vehicle_signals import VehicleSignals, signals_of
 
 SUFFIXES = (".rrd", ".mcap", ".json")
+_SCREENS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
+"""Variables of which a screen on Linux sets at least one."""
 _MAX_RESIDUALS = 3
 """Maximum number of crossings with residuals, as the user waits; `identify` computes more."""
 
@@ -66,6 +70,7 @@ def view_command(*, target: str | Path, web: bool, console: Console) -> int:
         raise InputError(f"{path}: no such file, one of {', '.join(SUFFIXES)} is expected")
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: is none of {', '.join(SUFFIXES)}")
+    prepare_viewer(window=not web)
     with tempfile.TemporaryDirectory(prefix="driveby-view-") as folder:
         shown = path
         if path.suffix != ".rrd":
@@ -227,8 +232,15 @@ def viewer_arguments(shown: Path | str, *, web: bool, address: str = "127.0.0.1"
     return [*arguments, str(shown)]
 
 
-def prepare_viewer() -> None:
-    """Switch its statistics off; raise FailureError if it is not installed."""
+def prepare_viewer(*, window: bool) -> None:
+    """Switch its statistics off.
+
+    Raise FailureError if it is not installed, or needs a `window` and there is no screen: it would
+    print ten log lines of its own.
+    """
+    linux = sys.platform.startswith("linux")
+    if window and linux and not any(os.environ.get(name) for name in _SCREENS):
+        raise FailureError("no screen for a window (DISPLAY is not set); try --web")
     program = viewer_program()
     if not program.is_file():
         raise FailureError(f"{program}: the Rerun viewer is not installed for this platform")
@@ -246,7 +258,7 @@ def run_viewer(shown: Path, *, web: bool) -> int:
 
     Raise FailureError if the viewer did not start, or ended abnormally.
     """
-    prepare_viewer()
+    prepare_viewer(window=not web)
     # The viewer would keep running if only this program received the signal to stop, also while the
     # viewer is being started.
     stop_requested = threading.Event()

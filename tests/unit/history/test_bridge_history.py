@@ -1,6 +1,7 @@
 """A bridge's past: fused when crossings are added, on a page of a report, and in the viewer."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -275,6 +276,7 @@ def test_view_opens_the_viewer_with_what_was_asked_for(tmp_path: Path) -> None:
         f"view.viewer_program = lambda: Path({str(program)!r})\n"
         f"sys.exit(main.main(['history', 'bridge-1', '--history', {str(history)!r}, '--view']))"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=LONGEST_S)
+    screen = {**os.environ, "DISPLAY": ":0"}
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=LONGEST_S, env=screen)
     assert shown.read_bytes().startswith(b"RRF2")
     assert shown.stat().st_size > 10_000
