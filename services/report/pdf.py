@@ -30,7 +30,7 @@ def find_browser() -> str:
             return found
     raise FailureError(
         "--pdf needs Chromium, Chrome or Edge, none is installed (Debian: apt install chromium); "
-        "without --pdf, open the HTML file in any browser and print it"
+        "or open the HTML file in any browser and print it"
     )
 
 

@@ -69,7 +69,6 @@ def _report(asked: ReportOptions) -> int:
     check_writable(output)
     if asked.pdf:
         check_writable(pdf, kinds=(PDF,))
-        browser = find_browser()
     files = []
     for path in asked.results:
         results = load_results(path)
@@ -88,6 +87,7 @@ def _report(asked: ReportOptions) -> int:
         print("no crossing of a known bridge")
     print(output)
     if asked.pdf:
+        browser = find_browser()
         with steps_bar(f"printing {pdf}") as progress:
             write_pdf(output, pdf, browser, progress)
         print(pdf)

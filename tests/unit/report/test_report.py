@@ -394,7 +394,7 @@ def test_what_cannot_be_reported_is_one_line_and_leaves_nothing(
         assert not (tmp_path / "r.html").exists()
 
 
-def test_without_a_browser_pdf_says_what_to_do_and_writes_nothing(
+def test_pdf_without_a_browser_writes_the_page_and_advises(
     capsys: pytest.CaptureFixture[str],
     written: tuple[Path, Path],
     tmp_path: Path,
@@ -405,9 +405,11 @@ def test_without_a_browser_pdf_says_what_to_do_and_writes_nothing(
     code, out, err = run(
         capsys, "report", found, "--site", site, "-o", tmp_path / "r.html", "--pdf"
     )
-    assert (code, out) == (1, "")
+    assert (code, out.splitlines()[-1]) == (1, str(tmp_path / "r.html"))
+    assert len(err.splitlines()) == 1
     assert "--pdf needs Chromium, Chrome or Edge, none is installed" in err
-    assert not (tmp_path / "r.html").exists()
+    assert (tmp_path / "r.html").exists()
+    assert not (tmp_path / "r.pdf").exists()
 
 
 def test_a_browser_that_prints_nothing_is_a_failure_with_the_page_left(
@@ -666,7 +668,10 @@ def test_coordinates_of_the_other_hemispheres_are_written_as_people_do(site: Sit
     south = {"start_latitude_deg": -36.1, "end_latitude_deg": -36.1002}
     west = {"start_longitude_deg": -3.5, "end_longitude_deg": -3.5003}
     moved = site.bridges[0].model_copy(update=south | west)
-    assert start_of(moved) == "the north-east end (36.10000° S, 3.50000° W)"
+    assert (
+        start_of(moved)
+        == "the north-east end (36.10000°\N{NO-BREAK SPACE}S, 3.50000°\N{NO-BREAK SPACE}W)"
+    )
 
 
 def test_no_change_has_no_sign(site: Site) -> None:
