@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from services.common.language import ENGLISH, Language
 from services.viewer.bridge_view import BridgeView, describe_bridge, origin_of
-from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView
+from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView, FloatArray
 from services.viewer.drawing import (
     BANNERS,
     BAR_EDGE,
@@ -126,9 +126,9 @@ def _draw_state(axes: Axes, bridge: BridgeView, language: Language) -> float:
     colour = MUTED if bridge.is_doubtful else BAR_EDGE
     label = language.text("figure.interval")
     draw_intervals(axes, places, low, high, colour=colour, label=label)
-    highest = max(highest, _draw_crossings(axes, bridge, places, language))
+    tops = np.maximum(high, _draw_crossings(axes, bridge, places, language))
     ratios = mean / (bridge.nominal_nm2 / 1e9)
-    label_bars(axes, places, low, high, [language.number(ratio, ".3f") for ratio in ratios])
+    label_bars(axes, places, low, tops, [language.number(ratio, ".3f") for ratio in ratios])
     doubt = "?" if bridge.is_doubtful else ""
     losses = {
         element.number: language.text(
@@ -136,8 +136,9 @@ def _draw_state(axes: Axes, bridge: BridgeView, language: Language) -> float:
         )
         for element in weak
     }
-    label_losses(axes, places, low, high, losses)
-    return max(1.1 * highest, top_above_labels(axes, low, high, losses))
+    label_losses(axes, places, low, tops, losses)
+    highest = max(highest, float(tops.max()))
+    return max(1.1 * highest, top_above_labels(axes, low, tops, losses))
 
 
 def _draw_before(axes: Axes, bridge: BridgeView, places: BarPlaces, language: Language) -> float:
@@ -158,12 +159,14 @@ def _draw_before(axes: Axes, bridge: BridgeView, places: BarPlaces, language: La
     return float(high.max())
 
 
-def _draw_crossings(axes: Axes, bridge: BridgeView, places: BarPlaces, language: Language) -> float:
-    """Draw the estimates of single crossings next to the interval; return the highest."""
+def _draw_crossings(
+    axes: Axes, bridge: BridgeView, places: BarPlaces, language: Language
+) -> FloatArray:
+    """Draw the estimates of single crossings next to the interval; return the highest (n,)."""
     drawn = [c for c in bridge.crossings if c.rigidity_nm2 is not None]
+    highest = np.zeros(places.centres_m.size)
     if len(drawn) < 2:
-        return 0.0
-    highest = 0.0
+        return highest
     named: set[str] = set()
     for place, crossing in zip(np.linspace(-0.4, -0.26, len(drawn)), drawn, strict=True):
         assert crossing.rigidity_nm2 is not None  # noqa: S101 - chosen by that
@@ -183,7 +186,7 @@ def _draw_crossings(axes: Axes, bridge: BridgeView, places: BarPlaces, language:
             label=None if crossing.verdict in named else label,
         )
         named.add(crossing.verdict)
-        highest = max(highest, float(values.max()))
+        highest = np.maximum(highest, values)
     return highest
 
 

@@ -136,7 +136,7 @@ def _draw_rigidity(axes: Axes, crossing: CrossingView, truth: list[float] | None
         true_values = np.asarray(truth) * nominal
         # To the side of the interval's line, which may be shorter than the marker.
         beside = centres - 0.22 * np.diff(edges)
-        axes.plot(beside, true_values, label="truth", zorder=4, **TRUTH_MARKER)
+        axes.plot(beside, true_values, label="truth", zorder=9, **TRUTH_MARKER)
         top = max(top, 1.1 * float(true_values.max()))
     if crossing.rigidity_nm2 is None:
         _write_rejection(axes, crossing)

@@ -135,10 +135,15 @@ def test_no_label_hides_a_single_crossing(site: Site) -> None:
     view = bridge_of(
         site, *(some_crossing(f"c{n}", entry=n * 86400.0) for n in range(4)), used="c3"
     )
-    axes = draw_bridge(view).axes[0]
+    high = [c._replace(rigidity_nm2=1.5 * c.rigidity_nm2) for c in view.crossings]
+    axes = draw_bridge(view._replace(crossings=tuple(high))).axes[0]
     dots = [line for line in axes.lines if line.get_marker() == "o"]
     assert len(dots) == 4
     assert min(d.get_zorder() for d in dots) > max(t.get_zorder() for t in axes.texts)
+    (loss,) = (text for text in axes.texts if "less" in text.get_text())
+    box = loss.get_window_extent().expanded(1.1, 1.3)
+    places = np.concatenate([axes.transData.transform(d.get_xydata()) for d in dots])
+    assert not np.any([box.contains(*place) for place in places])
 
 
 @pytest.mark.parametrize("name", ["x" * 60, "A 13 / <b>bridge</b> over $\\frac$ \\river"])
