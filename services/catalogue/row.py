@@ -34,7 +34,7 @@ class CatalogRow(NamedTuple):
     realms: tuple[str, ...]
     vehicles: tuple[str, ...]
     first_ns: int
-    """First time of measurement; 0 without one, as for `last_ns`."""
+    """First time of measurement, or without one of any message, as for `last_ns`."""
     last_ns: int
     messages: int
     rates_hz: dict[str, float]
@@ -100,6 +100,8 @@ class _RowBuilder:
 
     def __init__(self) -> None:
         self.messages = 0
+        self._logged_ns: list[int] = []
+        """First and last time of all messages."""
         self._times: dict[tuple[Key, int], list[int]] = {}
         self._rates: dict[str, float] = {}
         self._realms: set[str] = set()
@@ -107,6 +109,8 @@ class _RowBuilder:
 
     def add(self, key: Key, boot_id: int, message: RawMessage) -> None:
         self.messages += 1
+        times_ns = [*self._logged_ns, message.log_time_ns]
+        self._logged_ns = [min(times_ns), max(times_ns)]
         self._realms.add(key.realm)
         if key.owner != "vehicle":
             return
@@ -126,6 +130,7 @@ class _RowBuilder:
     def row(self, entry: Entry, content: bytes) -> CatalogRow:
         gaps = [gap for key, times in self._times.items() for gap in _gaps(key[0], times)]
         every = [t for times in self._times.values() for t in (min(times), max(times))]
+        every = every or self._logged_ns
         steps = sorted(
             b - a
             for (key, _), times in self._times.items()
@@ -143,8 +148,8 @@ class _RowBuilder:
             content,
             tuple(sorted(self._realms)),
             tuple(sorted({key.identifier for key, _ in self._times})),
-            min(every, default=0),
-            max(every, default=0),
+            min(every),
+            max(every),
             self.messages,
             rates,
             len(gaps),

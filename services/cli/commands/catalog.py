@@ -75,7 +75,7 @@ def _summary(rows: "list[CatalogRow]", added: int) -> str:
         f"{len(vehicles)} truck{'s' if len(vehicles) != 1 else ''}, {size / 1e6:.1f} MB, "
         f"{gaps} gap{'s' if gaps != 1 else ''}"
     )
-    measured = [row for row in rows if row.first_ns]  # recordings of results have no measurement
+    measured = [row for row in rows if row.vehicles]  # recordings of results have none
     if measured:
         begin, end = min(row.first_ns for row in measured), max(row.last_ns for row in measured)
         said += f", {_time(begin)} to {_time(end)}"

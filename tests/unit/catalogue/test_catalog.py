@@ -396,16 +396,18 @@ def test_the_command(
 def test_a_recording_without_measurements_does_not_begin_the_fleet(
     fleet: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Recordings of results have no time of measurement: the fleet began in 1970."""
+    """Nor does it stand in a folder of 1970."""
     assert cli.main(["catalog", str(fleet)]) == 0
     before = capsys.readouterr().out.partition(" gap")[2].partition("\n")[0]
-    health = pb.Health(schema_version=1, service="logger", time_ns=START_NS).SerializeToString()
+    later_ns = START_NS + 86_400 * S
+    health = pb.Health(schema_version=1, service="logger", time_ns=later_ns).SerializeToString()
     where = Key("live", "service", "logger", "health")
-    record(fleet / "_service.mcap", iter([Message(where, health, 1, 1, START_NS, START_NS)]))
+    record(fleet / "_service.mcap", iter([Message(where, health, 1, 1, later_ns, later_ns)]))
     assert cli.main(["catalog", str(fleet)]) == 0
     said = capsys.readouterr().out
     assert said.startswith("4 recordings (1 new to the catalogue)")
     assert said.partition(" gap")[2].partition("\n")[0] == before
+    assert read_catalog(folder_at(str(fleet))).rows["_service.mcap"].first_ns == later_ns
 
 
 def test_an_import_adds_its_row_where_there_is_a_catalogue(
