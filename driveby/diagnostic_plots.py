@@ -53,9 +53,10 @@ def plot_posterior(solution: Solution, names: Sequence[str] | None = None) -> Fi
         figure, panels = _panels(_chosen(solution, names), 2.0)
         for name, axes in panels:
             found = solution.value[name]
-            draws = solution.draws[name].ravel()
+            divisor, unit = _shown_unit(found.mean, found.unit)
+            draws = solution.draws[name].ravel() / divisor
             if found.prior is not None:
-                prior = prior_draws(found.prior)
+                prior = prior_draws(found.prior) / divisor
                 limits = np.percentile(prior, _CUT)
                 axes.hist(
                     prior,
@@ -67,9 +68,10 @@ def plot_posterior(solution: Solution, names: Sequence[str] | None = None) -> Fi
                 )
             axes.hist(draws, bins=_BINS, density=True, label="posterior")
             for limit in (found.q025, found.q975):
-                axes.axvline(limit, color="0.3", lw=0.8, ls="--")
-            axes.set_xlim(found.mean - _SHOWN * found.std, found.mean + _SHOWN * found.std)
-            axes.set_xlabel(found.unit)
+                axes.axvline(limit / divisor, color="0.3", lw=0.8, ls="--")
+            reach = np.array([-_SHOWN, _SHOWN]) * found.std
+            axes.set_xlim(*((found.mean + reach) / divisor))
+            axes.set_xlabel(unit)
             axes.set_yticks([])
         figure.axes[0].legend(fontsize="small")
     return figure
@@ -83,11 +85,20 @@ def plot_chains(solution: Solution, names: Sequence[str] | None = None) -> Figur
     with matplotlib.rc_context(STYLE):
         figure, panels = _panels(_chosen(solution, names), 1.8)
         for name, axes in panels:
+            divisor, unit = _shown_unit(solution.value[name].mean, solution.value[name].unit)
             for chain in solution.draws[name]:
-                axes.plot(chain, lw=0.4, alpha=0.7)
+                axes.plot(chain / divisor, lw=0.4, alpha=0.7)
             axes.set_xlabel("draw")
-            axes.set_ylabel(solution.value[name].unit)
+            axes.set_ylabel(unit)
     return figure
+
+
+def _shown_unit(value: float, unit: str) -> tuple[float, str]:
+    """Return a divisor and the unit with its prefix, such as 1e9 and GN·m²: ticks need no power."""
+    for divisor, prefix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if unit.startswith("N") and abs(value) >= divisor:
+            return divisor, prefix + unit
+    return 1.0, unit
 
 
 def _chosen(solution: Solution, names: Sequence[str] | None) -> list[str]:

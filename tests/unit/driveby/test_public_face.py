@@ -647,7 +647,11 @@ def test_diagnostic_plots_have_a_panel_for_each_parameter(found: driveby.Identif
     assert road is not None
     drawn = residual.lines[0].get_ydata()
     assert drawn == pytest.approx(1e3 * (np.array(road.front_m) - np.array(road.rear_m)))
-    assert len(driveby.plot_posterior(solution).axes) == solution.bridge.elements
+    posterior = driveby.plot_posterior(solution).axes
+    assert {axes.get_xlabel() for axes in posterior} == {"GN·m²"}
+    low_gn, high_gn = posterior[3].get_xlim()
+    assert len(posterior) == solution.bridge.elements
+    assert low_gn < solution.value["EI_4"].mean / 1e9 < high_gn
     chains = driveby.plot_chains(solution, ["rhoA", "EI_4"]).axes
     assert [axes.get_title(loc="left") for axes in chains] == ["rhoA", "EI_4"]
     assert len(chains[0].lines) == len(solution.draws["rhoA"])
