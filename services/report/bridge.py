@@ -211,12 +211,13 @@ def _one_by_one(view: BridgeView, baseline: Estimate | None, language: Language)
     for weak in view.comparison.weak:
         losses = [1.0 - one.elements[weak.number - 1].ratio for one in found if one is not None]
         if len(losses) >= 2:
+            low, high = 100.0 * min(losses), 100.0 * max(losses)
+            key = "losses.same" if round(low) == round(high) else "losses.range"
             yield language.text(
                 "finding.scatter",
                 number=len(losses),
                 element=weak.number,
-                low=100.0 * min(losses),
-                high=100.0 * max(losses),
+                losses=language.text(key, low=low, high=high),
             )
 
 

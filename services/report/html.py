@@ -27,8 +27,13 @@ def tag(name: str, /, *children: str, **attributes: str) -> Html:
 
 
 def joined(*children: str) -> Html:
-    """Return several pieces, one after the other."""
-    return Html("".join(c if isinstance(c, Html) else escape(c) for c in children))
+    """Return several pieces, one after the other; no line of text begins with a %."""
+    return Html(
+        "".join(
+            c if isinstance(c, Html) else escape(c).replace(" %", "\N{NO-BREAK SPACE}%")
+            for c in children
+        )
+    )
 
 
 def table(heads: list[str], rows: list[list[str]], classes: list[str] | None = None) -> Html:

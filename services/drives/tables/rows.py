@@ -63,16 +63,16 @@ def _samples_of(
         raise InputError(f"{part.sheet.path}: no row has all of {', '.join(names)}")
     if not whole.all():
         first = part.sheet.numbers[int(np.flatnonzero(~whole)[0])]
-        text = f"{int((~whole).sum())} rows with empty cells left out, a gap (first: line {first})"
+        text = f"rows with empty cells left out, a gap: {int((~whole).sum())} (first: line {first})"
         found.guess(part, text, "lost")
     values, time_s = values[whole], part.times.time_s[whole]
     declared = target.declared_hz
     even = part.given.time.even
     kept = kept_rows(time_s, values, declared, even=even, where=str(part.sheet.path))
     if kept.repeated:
-        found.guess(part, f"{kept.repeated} repeated rows left out", "lost")
+        found.guess(part, f"repeated rows left out: {kept.repeated}", "lost")
     if kept.late:
-        found.guess(part, f"{kept.late} rows not later than the row before left out", "lost")
+        found.guess(part, f"rows not later than the row before left out: {kept.late}", "lost")
     if kept.is_even and even is None:
         found.guess(part, f"stamps are rounded: samples even at {declared:g} Hz")
     found.time(part, even=kept.is_even)

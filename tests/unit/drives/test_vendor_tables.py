@@ -319,18 +319,18 @@ VARIANTS: dict[str, Variant] = {
     ),
     "rows written twice": Variant(
         lambda: pair(rows(ACCEL, slice(0, 2000), slice(1990, None))),
-        note="10 repeated rows left out",
+        note="repeated rows left out: 10",
     ),
     "one row twice": Variant(
         lambda: pair(rows(ACCEL, slice(0, 2000), slice(1999, None))),
-        note="1 repeated rows left out",
+        note="repeated rows left out: 1",
     ),
     "one fix twice": Variant(
         lambda: pair(gps=rows(GPS, slice(0, 9), slice(8, None))), note="1 fixes with a repeated"
     ),
     "one empty cell": Variant(
         lambda: pair(holes(ACCEL, "sprung_rear", slice(1700, 1701))),
-        note="1 rows with empty cells left out, a gap (first: line 1702)",
+        note="rows with empty cells left out, a gap: 1 (first: line 1702)",
         left_out=(slice(1700, 1701),),
     ),
     "other names of files": Variant(lambda: {"run1.csv": table(ACCEL), "gnss1.csv": table(GPS)}),
@@ -637,7 +637,7 @@ VARIANTS |= {
             ),
             P: table(GPS),
         },
-        note="1 rows with empty cells left out",
+        note="rows with empty cells left out, a gap: 1",
         left_out=(slice(700, 701),),
     ),
     "9999 for no value": Variant(
