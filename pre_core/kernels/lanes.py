@@ -28,6 +28,9 @@ compiled = partial(njit, cache=True, nogil=True)
 # first; a process that compiled gave other last digits than one that loaded. So all are inlined.
 _inlined = partial(compiled, error_model="numpy", forceinline=True)
 
+# Every operation is rounded as written.
+exact = _inlined()
+
 # Contraction allows fused multiply-add; no other reordering of the arithmetic is allowed, so that
 # results depend only to rounding on which particles are evaluated together.
 kernel = _inlined(fastmath={"contract", "nsz"})
