@@ -18,15 +18,8 @@ from services.drives.runs import run_to_messages
 from services.identification.footprints import footprints_of
 from services.recordings.writer import write_recording
 from services.simulation.schedule import ONCE, Schedule, begun_at
-from services.simulation.two_sided import (
-    Body,
-    Deck,
-    Torsion,
-    WideAxle,
-    WideBogie,
-    WideTruck,
-    bending_frequencies_hz,
-)
+from services.simulation.two_sided import Body, WideAxle, WideBogie, WideTruck
+from services.simulation.two_sided_deck import Deck, Torsion, bending_frequencies_hz
 from services.simulation.wheel_paths import REAR_OFFSET_M, SurfaceOptions
 from services.simulation.wide_crossings import (
     START_TIME_S,

@@ -20,16 +20,8 @@ from schemas.signals import CHANNELS
 from schemas.site import Bridge
 from services.drives.runs import Run
 from services.simulation.positions import START_TIME_S, gnss_track
-from services.simulation.two_sided import (
-    Body,
-    Deck,
-    Torsion,
-    WideAxle,
-    WideMotion,
-    WideRoad,
-    WideTruck,
-    cross,
-)
+from services.simulation.two_sided import Body, WideAxle, WideMotion, WideRoad, WideTruck, cross
+from services.simulation.two_sided_deck import Deck, Torsion
 from services.simulation.two_sided_surface import draw_waves
 from services.simulation.wheel_paths import WheelPaths
 from services.simulation.wide_crossings import WideSensor, middle_channels, road_under, sensor_row

@@ -54,7 +54,7 @@ from services.simulation.effects import (
     TORSION,
 )
 from services.simulation.pavement import PLAIN, Pavement
-from services.simulation.two_sided import Torsion
+from services.simulation.two_sided_deck import Torsion
 from services.simulation.wheel_paths import SurfaceOptions, WheelPaths, wheel_paths_of
 from services.simulation.wide_crossings import WideSensor
 

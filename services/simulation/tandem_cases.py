@@ -9,7 +9,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
-from services.simulation.two_sided import Deck, WideAxle, WideBogie, WideTruck, static_axle_loads_n
+from services.simulation.two_sided import WideAxle, WideBogie, WideTruck, static_axle_loads_n
+from services.simulation.two_sided_deck import Deck
 from services.simulation.wide_cases import (
     SINGLE,
     TWIN,

@@ -13,15 +13,13 @@ from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from schemas.wgs84 import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
 from services.simulation.two_sided import (
     Body,
-    Deck,
     Kingpin,
-    Torsion,
     WideAxle,
     WideBogie,
     WideTruck,
-    bending_frequencies_hz,
     static_axle_loads_n,
 )
+from services.simulation.two_sided_deck import Deck, Torsion, bending_frequencies_hz
 from services.simulation.wide_crossings import (
     USUAL_RECEIVER,
     SatelliteErrors,

@@ -25,8 +25,6 @@ from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run
 from services.simulation.two_sided import (
     LONGEST_STEP_S,
-    Deck,
-    WideResponse,
     WideRoad,
     WideTruck,
     axle_row,
@@ -36,6 +34,8 @@ from services.simulation.two_sided import (
     static_axle_loads_n,
     tyres_of,
 )
+from services.simulation.two_sided_deck import Deck
+from services.simulation.two_sided_march import WideResponse
 from services.simulation.two_sided_surface import Strip, Waves, draw_waves, heights_m
 
 Floats = NDArray[np.float64]

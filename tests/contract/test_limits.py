@@ -32,7 +32,6 @@ LONG_MODULES = {
     "pre_core.crossing.residuals": 767,
     "pre_core.paper.residual": 579,
     "services.logger.writer": 508,
-    "services.simulation.two_sided": 861,
     "services.viewer.rerun_crossing": 490,
 }
 
@@ -55,10 +54,6 @@ LONG_FUNCTIONS = {
     "services.simulation.drawn:draw_truth": 78,
     "services.simulation.drawn:drive": 93,
     "services.simulation.drive_wide:measured_wide_run": 69,
-    "services.simulation.two_sided:_derivative": 78,
-    "services.simulation.two_sided:_march": 146,
-    "services.simulation.two_sided:_system": 70,
-    "services.simulation.two_sided:cross": 61,
     "services.simulation.wide_cases:draw_wide": 78,
     "services.simulation.out_of_model:draw_out_of_model": 78,
     "studies.paper.scenarios:run_scenario": 71,
@@ -91,8 +86,6 @@ MANY_ARGUMENTS = {
     "services.simulation.drive:simulate_drive": 12,
     "services.simulation.drive_wide:measured_wide_run": 12,
     "services.simulation.positions:gnss_track": 8,
-    "services.simulation.two_sided:_derivative": 23,
-    "services.simulation.two_sided:_march": 19,
     "services.simulation.two_sided_surface:_heights": 9,
     "services.simulation.wide_crossings:road_under": 8,
     "studies.paper.scenarios:run_scenario": 8,

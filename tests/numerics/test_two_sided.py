@@ -17,22 +17,20 @@ from pre_core.physics.vehicle import HalfCar, dahl_friction_n
 from services.simulation.two_sided import (
     LONGEST_STEP_S,
     Body,
-    Deck,
     Kingpin,
-    Torsion,
     WideAxle,
     WideBogie,
-    WideResponse,
     WideRoad,
     WideTruck,
     axle_row,
-    bending_frequencies_hz,
     body_row,
     cross,
     even_motion,
     static_axle_loads_n,
     tyres_of,
 )
+from services.simulation.two_sided_deck import Deck, Torsion, bending_frequencies_hz
+from services.simulation.two_sided_march import WideResponse
 from services.simulation.two_sided_surface import (
     Strip,
     density_constant_m2,

@@ -21,8 +21,8 @@ from services.simulation.drive_wide import deck_with_width, truck_with_width
 from services.simulation.effects import ALONE, EVERYTHING, ON_SURFACES
 from services.simulation.out_of_model import OutOfModelTruth, draw_out_of_model
 from services.simulation.pavement import PLAIN
-from services.simulation.two_sided import bending_frequencies_hz
 from services.simulation.two_sided import static_axle_loads_n as static_loads
+from services.simulation.two_sided_deck import bending_frequencies_hz
 from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
 from studies.validation import worlds as validation
 from studies.validation.worlds import (

@@ -11,7 +11,8 @@ from schemas.site_file import load_site
 from services.common.geodesy import bridge_frame, to_chainage
 from services.drives.csv_import import read_folder
 from services.simulation import wide_cases
-from services.simulation.two_sided import bending_frequencies_hz, static_axle_loads_n
+from services.simulation.two_sided import static_axle_loads_n
+from services.simulation.two_sided_deck import bending_frequencies_hz
 from services.simulation.wide_cases import (
     draw_wide,
     middle_sensors,
