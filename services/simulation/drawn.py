@@ -14,7 +14,7 @@ finder: the identification gets what it would get from a recording.
 """
 
 import time
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ from pre_core.physics.vehicle import HalfCar
 from schemas.reasons import Reason
 from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
-from schemas.site import Bridge, Site, Vehicle
+from schemas.site import Bridge, Sensor, Site, Vehicle
 from services.drives.runs import Run, run_to_messages
 from services.finding.crossing_data import CrossingData
 from services.finding.finder import crossings_in
@@ -39,9 +39,11 @@ from services.identification.pre_method import absence
 from services.simulation.drive import (
     LONGEST_STEP_S,
     SETTLE_S,
+    TRUCK_KEYS,
     DepartedVehicle,
     beam_of,
     declared_site,
+    half_car,
     measured_run,
     paper_site,
     with_two_axles,
@@ -75,6 +77,22 @@ _CG_HEIGHT_M = 1.1
 """Height of a loaded truck's centre of gravity above the road."""
 _LARGEST_CHANGE = 0.3
 """Largest relative change of speed in either direction."""
+
+
+_DRAWN_FIRST: Final = (
+    "unsprung_mass_kg",
+    "total_mass_kg",
+    "front_axle_to_cg_m",
+    "wheelbase_m",
+    "suspension_damping_ns_per_m",
+    "suspension_stiffness_n_per_m",
+    "tyre_stiffness_n_per_m",
+    "pitch_inertia_ratio",
+    "cg_height_m",
+)
+"""Quantities of a truck in the order of their draws, on which the truth of a seed depends."""
+_DRAWN_LAST: Final = tuple(key for key in TRUCK_KEYS if key not in _DRAWN_FIRST)
+"""Those that may be zero, and any later row of the parameter table."""
 
 
 class DriveConditions(NamedTuple):
@@ -157,36 +175,22 @@ def default_site() -> Site:
 def draw_truth(site: Site, seed: int) -> CrossingTruth:
     """Draw everything that the site's priors and the conditions above leave open."""
     rng = np.random.default_rng(np.random.SeedSequence([seed, 0x7247]))
-    vehicle, bridge, sensor = site.vehicles[0], site.bridges[0], site.sensor
+    vehicle, bridge = site.vehicles[0], site.bridges[0]
 
     def log_normal(nominal: float, spread: float) -> float:
         return float(nominal * np.exp(spread * rng.standard_normal()))
 
-    def of_truck(key: str) -> float:
-        return log_normal(getattr(vehicle, key), vehicle.spread(key))
+    def of_truck(key: str) -> Any:
+        drawn = tuple(log_normal(value, vehicle.spread(key)) for value in vehicle.nominal(key))
+        return drawn if len(drawn) > 1 else drawn[0]
 
-    def pair(key: str) -> tuple[float, float]:
-        front, rear = getattr(vehicle, key)
-        return log_normal(front, vehicle.spread(key)), log_normal(rear, vehicle.spread(key))
-
-    unsprung = pair("unsprung_mass_kg")
-    car = HalfCar(
-        body_mass_kg=of_truck("total_mass_kg") - sum(unsprung),
-        front_axle_to_cg_m=of_truck("front_axle_to_cg_m"),
-        wheelbase_m=of_truck("wheelbase_m"),
-        suspension_damping_ns_per_m=pair("suspension_damping_ns_per_m"),
-        suspension_stiffness_n_per_m=pair("suspension_stiffness_n_per_m"),
-        unsprung_mass_kg=unsprung,
-        tyre_stiffness_n_per_m=pair("tyre_stiffness_n_per_m"),
-        pitch_inertia_ratio=of_truck("pitch_inertia_ratio"),
-        cg_height_m=0.0 if vehicle.cg_height_m is None else of_truck("cg_height_m"),
-    )
+    known = [key for key in _DRAWN_FIRST if getattr(vehicle, key) is not None]
+    values = {key: of_truck(key) for key in known}
     ei_spread = bridge.spread("flexural_rigidity_nm2")
     ratios = np.exp(ei_spread * rng.standard_normal(bridge.elements))
     beam = beam_of(bridge, ratios)
-    mass_per_length = log_normal(
-        bridge.mass_per_length_kg_per_m, bridge.spread("mass_per_length_kg_per_m")
-    )
+    key = "mass_per_length_kg_per_m"
+    mass_per_length = log_normal(bridge.mass_per_length_kg_per_m, bridge.spread(key))
     springs = np.abs(rng.standard_normal(2))
     beam = beam._replace(
         mass_per_length_kg_per_m=np.full(bridge.elements, mass_per_length),
@@ -195,17 +199,12 @@ def draw_truth(site: Site, seed: int) -> CrossingTruth:
         ),
         rayleigh_beta_s=log_normal(bridge.rayleigh_beta_s, bridge.spread("rayleigh_beta_s")),
     )
-    channels = ChannelErrors(
-        float(sensor.common_gain_spread * rng.standard_normal()),
-        sensor.gain_spread * rng.standard_normal(4),
-        sensor.delay_spread_s * rng.standard_normal(4),
-        _BIAS_M_PER_S2 * rng.standard_normal(4),
-    )
+    channels = _draw_channels(site.sensor, rng)
     receiver = site.receiver
     latency = receiver.latency_s + receiver.latency_spread_s * float(rng.standard_normal())
     conditions = _draw_conditions(vehicle, rng)
     compliances = np.abs(rng.standard_normal(2))
-    of_axle = np.abs(rng.standard_normal(2))
+    sizes = {key: np.abs(rng.standard_normal(len(vehicle.nominal(key)))) for key in _DRAWN_LAST}
 
     def at_end(place: int, size: float) -> float:
         row = parameters.SCALARS[place]
@@ -222,16 +221,25 @@ def draw_truth(site: Site, seed: int) -> CrossingTruth:
             at_end(parameters.F + 1, compliances[1]),
         ),
     )
-    tyres = "tyre_damping_ns_per_m"
-    scale = vehicle.scale_at_zero(tyres)
-    front, rear = vehicle.tyre_damping_ns_per_m
-    car = car._replace(
-        tyre_damping_ns_per_m=(
-            log_normal(front, vehicle.spread(tyres)) if front else float(scale * of_axle[0]),
-            log_normal(rear, vehicle.spread(tyres)) if rear else float(scale * of_axle[1]),
+    for key, at_zero in sizes.items():
+        scale = vehicle.scale_at_zero(key)
+        drawn = tuple(
+            log_normal(value, vehicle.spread(key)) if value else float(scale * size)
+            for value, size in zip(vehicle.nominal(key), at_zero, strict=True)
         )
-    )
+        values[key] = drawn if len(drawn) > 1 else drawn[0]
+    mass_kg, wheelbase_m = values.pop("total_mass_kg"), values.pop("wheelbase_m")
+    car = half_car(values, mass_kg, wheelbase_m, values.pop("cg_height_m", None))
     return CrossingTruth(car, beam, channels, latency, conditions)
+
+
+def _draw_channels(sensor: Sensor, rng: np.random.Generator) -> ChannelErrors:
+    return ChannelErrors(
+        float(sensor.common_gain_spread * rng.standard_normal()),
+        sensor.gain_spread * rng.standard_normal(4),
+        sensor.delay_spread_s * rng.standard_normal(4),
+        _BIAS_M_PER_S2 * rng.standard_normal(4),
+    )
 
 
 def _draw_conditions(vehicle: Vehicle, rng: np.random.Generator) -> DriveConditions:

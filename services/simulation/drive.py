@@ -4,16 +4,17 @@ The truth is computed on a mesh ten times finer than the elements, with 40 modes
 steps of at most 0.1 ms, so that no identification shares its discretisation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.paper import experiment
+from pre_core.parameters import SCALARS, TRUCK
 from pre_core.physics.bridge import (
     Beam,
     modes,
@@ -59,6 +60,10 @@ SETTLE_S = 3.0
 _BEFORE_S, _AFTER_S = 3.0, 2.5
 _ROAD_SPACING_M = 0.01
 _CONTACT_PATCH_M = 0.2
+TRUCK_KEYS: Final = tuple(
+    dict.fromkeys(row.key for row in SCALARS if row.part == TRUCK and row.key in HalfCar._fields)
+)
+"""Quantities of a two-axle truck that are in the parameter table."""
 
 
 class DepartedVehicle(NamedTuple):
@@ -311,17 +316,19 @@ def with_two_axles(vehicle: Vehicle) -> Vehicle:
 def truck_of(vehicle: Vehicle) -> HalfCar:
     """Return the site's nominal truck; raise InputError for one with a tandem."""
     vehicle = with_two_axles(vehicle)
+    values = {key: getattr(vehicle, key) for key in TRUCK_KEYS}
+    return half_car(values, vehicle.total_mass_kg, vehicle.wheelbase_m, vehicle.cg_height_m)
+
+
+def half_car(
+    values: Mapping[str, Any], total_mass_kg: float, wheelbase_m: float, cg_height_m: float | None
+) -> HalfCar:
+    """Return the truck whose quantities of the parameter table (TRUCK_KEYS) have these values."""
     return HalfCar(
-        body_mass_kg=vehicle.sprung_mass_kg,
-        front_axle_to_cg_m=vehicle.front_axle_to_cg_m,
-        wheelbase_m=vehicle.wheelbase_m,
-        suspension_damping_ns_per_m=vehicle.suspension_damping_ns_per_m,
-        suspension_stiffness_n_per_m=vehicle.suspension_stiffness_n_per_m,
-        unsprung_mass_kg=vehicle.unsprung_mass_kg,
-        tyre_stiffness_n_per_m=vehicle.tyre_stiffness_n_per_m,
-        pitch_inertia_ratio=vehicle.pitch_inertia_ratio,
-        tyre_damping_ns_per_m=vehicle.tyre_damping_ns_per_m,
-        cg_height_m=vehicle.cg_height_m or 0.0,
+        body_mass_kg=total_mass_kg - sum(values["unsprung_mass_kg"]),
+        wheelbase_m=wheelbase_m,
+        cg_height_m=cg_height_m or 0.0,
+        **values,
     )
 
 

@@ -51,7 +51,6 @@ LONG_FUNCTIONS = {
     "services.ledger.recorded_crossings:scan_stays": 69,
     "services.identification.bridge_state:state_of": 69,
     "services.identification.pre_method:identify_pre": 77,
-    "services.simulation.drawn:draw_truth": 78,
     "services.simulation.drawn:drive": 93,
     "services.simulation.drive_wide:measured_wide_run": 69,
     "services.simulation.wide_cases:draw_wide": 78,
