@@ -40,6 +40,16 @@ _SLICE_WIDTH = 1.0
 _MAX_WIDENINGS = 12
 
 
+class _SampledDensity(NamedTuple):
+    """The part of a `CompliancePosterior` that the Gibbs sampler needs."""
+
+    precision: FloatArray  # (k, k)
+    linear: FloatArray  # (k,)
+    log_odds: FloatArray  # (k,)
+    sigma: FloatArray  # (elements,)
+    inflation: float
+
+
 class CompliancePosterior(NamedTuple):
     """The density over y (f,), of which the coordinates `elements` are -ln(c)/sigma."""
 
@@ -186,17 +196,14 @@ def draws(
         )
         start[:e] += 0.3 * rng.standard_normal(e)
     sampled = np.empty((count, posterior.sampled.size))
-    _gibbs(
+    density = _SampledDensity(
         posterior.precision,
         posterior.linear,
         posterior.log_odds,
         posterior.sigma,
         posterior.inflation,
-        start,
-        _SETTLING if after is None else _SWEEPS,
-        rng,
-        sampled,
     )
+    _gibbs(density, start, _SETTLING if after is None else _SWEEPS, rng, sampled)
     x = sampled.copy()
     x[:, :e] = np.exp(-posterior.sigma * sampled[:, :e])
     mean = posterior.others_linear - x @ posterior.others_sampled.T
@@ -210,17 +217,15 @@ def draws(
 
 @kernel
 def _gibbs(
-    precision: FloatArray,
-    linear: FloatArray,
-    log_odds: FloatArray,
-    sigma: FloatArray,
-    inflation: float,
+    density: _SampledDensity,
     start: FloatArray,
     settling: int,
     rng: np.random.Generator,
     out: FloatArray,
 ) -> None:
     """Fill out (count, k) from `start` (k,): y of elements, then non-negative coordinates."""
+    precision, linear, log_odds = density.precision, density.linear, density.log_odds
+    sigma, inflation = density.sigma, density.inflation
     k, e = start.size, sigma.size
     y = start.copy()
     x = start.copy()

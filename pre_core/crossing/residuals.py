@@ -41,7 +41,7 @@ from pre_core.parameters import (
     TORSION,
 )
 from pre_core.physics import modal_response
-from pre_core.physics.beam_basis import BeamBasis
+from pre_core.physics.beam_basis import BeamBasis, ModalFilters
 from pre_core.physics.tandem import NO_LEAD, Lead
 from pre_core.physics.torsion import (
     GROUPS,
@@ -63,7 +63,7 @@ _WHITE, _PLAIN, _DEFLECTIONS = range(3)
 """Outputs of `_evaluate`: whitened (3 m or more,), residuals (3 rows,), or deflections (2 n,)."""
 _NOTHING = np.zeros(0)
 _NO_ROWS = RowFilter(_NOTHING, 1, 0.0, _NOTHING, _NOTHING, np.zeros((0, 0), dtype=np.complex128))
-_NO_NOISE = Whitener(np.zeros((0, 0)), _NOTHING)
+_NO_FILTERS = (_NO_ROWS, Whitener(np.zeros((0, 0)), _NOTHING))
 
 
 class GriddedCrossing(NamedTuple):
@@ -293,17 +293,9 @@ def _bridge(crossing: GriddedCrossing, work: Buffers, theta: FloatArray) -> bool
             same = False
     if same:
         return True
-    basis = crossing.basis
+    filters = ModalFilters(work.cubics, work.feedback, work.state)
     if not modal_response.modal_filters(
-        basis.stiffness,
-        basis.cubics,
-        theta,
-        crossing.step_s,
-        work.matrix,
-        work.vectors,
-        work.cubics,
-        work.feedback,
-        work.modes,
+        crossing.basis, theta, crossing.step_s, work.matrix, work.vectors, filters, work.modes
     ):
         work.modes_of[:] = np.nan
         return False
@@ -465,30 +457,15 @@ def _advance(work: Buffers, begin: int, stop: int) -> None:
     """March all modes over the samples of a stretch in which each wheel stays in one part."""
     if work.part.shape[0] == 3:
         tandem.advance(work, begin, stop)
-    elif work.at_end[begin]:
-        modal_response.advance_with_ends(
-            work.cubics,
-            work.part[0, begin],
-            work.part[1, begin],
-            work.feedback,
-            work.state,
-            work.place[:, begin:stop],
-            work.force,
-            work.end_force[:, begin:stop],
-            work.end_share[:, :, begin:stop],
-            work.lanes,
-        )
+        return
+    filters = ModalFilters(work.cubics, work.feedback, work.state)
+    place, front, rear = work.place[:, begin:stop], work.part[0, begin], work.part[1, begin]
+    wheels = modal_response.LoadedStretch(front, rear, place, work.force, work.lanes)
+    if work.at_end[begin]:
+        force, share = work.end_force[:, begin:stop], work.end_share[:, :, begin:stop]
+        modal_response.advance_with_ends(filters, wheels, modal_response.EndStretch(force, share))
     else:
-        modal_response.advance(
-            work.cubics,
-            work.part[0, begin],
-            work.part[1, begin],
-            work.feedback,
-            work.state,
-            work.place[:, begin:stop],
-            work.force,
-            work.lanes,
-        )
+        modal_response.advance(filters, wheels)
 
 
 @kernel
@@ -603,20 +580,19 @@ def _compare(crossing: GriddedCrossing, work: Buffers, out: FloatArray) -> None:
 @kernel
 def _evaluate(
     crossing: GriddedCrossing,
-    rows: RowFilter,
-    noise: Whitener,
+    filters: tuple[RowFilter, Whitener],
     work: Buffers,
     points: EvaluationPoints,
-    begin: int,
-    stop: int,
+    part: tuple[int, int],
     what: int,
     out: FloatArray,
 ) -> None:
-    """Compute the requested output of some points to their rows of `out`; NaN if impossible.
+    """Compute the requested output of points `part` to their rows of `out`; NaN if impossible.
 
     One kernel for all three: each would hold a copy of the model, and take as long to load.
     """
-    for k in range(begin, stop):
+    rows, noise = filters
+    for k in range(part[0], part[1]):
         row = out[k]
         if not (
             _is_possible(points.theta[k], points.wheelbase_m[k], crossing.lead.readings_apart_m)
@@ -684,7 +660,7 @@ def evaluate(
     out = np.empty((points.theta.shape[0], RESIDUALS * crossing.rows))
 
     def part(work: Buffers, begin: int, stop: int) -> None:
-        _evaluate(crossing, _NO_ROWS, _NO_NOISE, work, points, begin, stop, _PLAIN, out)
+        _evaluate(crossing, _NO_FILTERS, work, points, (begin, stop), _PLAIN, out)
 
     _in_threads(part, works, out.shape[0])
     return out.reshape(-1, RESIDUALS, crossing.rows)
@@ -701,7 +677,7 @@ def evaluate_white(
     """Compute whitened residuals of points to columns of `out` (k, 3 m or more); NaN as above."""
 
     def part(work: Buffers, begin: int, stop: int) -> None:
-        _evaluate(crossing, rows, noise, work, points, begin, stop, _WHITE, out)
+        _evaluate(crossing, (rows, noise), work, points, (begin, stop), _WHITE, out)
 
     _in_threads(part, works, out.shape[0])
     if noise.lines.size or noise.low_rank.size:
@@ -762,5 +738,5 @@ def _deflections(
     """Return the deflections of point k (2, n), `work.road` its negated profiles; or NaN."""
     one = EvaluationPoints(*(of[k : k + 1] for of in points))
     out = np.empty((1, work.road.size))
-    _evaluate(crossing, _NO_ROWS, _NO_NOISE, work, one, 0, 1, _DEFLECTIONS, out)
+    _evaluate(crossing, _NO_FILTERS, work, one, (0, 1), _DEFLECTIONS, out)
     return out.reshape(work.road.shape)

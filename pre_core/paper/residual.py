@@ -22,6 +22,8 @@ from pre_core.paper.integrate import Integrated
 from pre_core.parameters import D_1, KAPPA, M_U1
 from pre_core.physics.beam_basis import (
     BeamBasis,
+    ModalFilters,
+    WheelStretch,
     advance,
     beam_basis,
     modal_filters,
@@ -268,8 +270,6 @@ def _march_stretch(
     stop: int,
     element_front: int,
     element_rear: int,
-    cubics: FloatArray,
-    feedback: FloatArray,
 ) -> None:
     """Write minus the road under both wheels, y - u, of one stretch to `work.road`."""
     a = window.acceleration
@@ -292,18 +292,23 @@ def _march_stretch(
         store(p1, n - begin, (t - f[0], t - f[1], t - f[2], t - f[3]))
         f = fma_scalar(m22, a[1, n], fma_scalar(m12, a[0, n], fma_scalar(mu2, a[3, n], w2)))
         store(p2, n - begin, (-t - f[0], -t - f[1], -t - f[2], -t - f[3]))
-    advance(
-        cubics[max(element_front, 0)],
-        cubics[max(element_rear, 0)],
-        element_front >= 0,
-        element_rear >= 0,
-        feedback,
-        work.state,
+    filters = ModalFilters(work.cubics, work.feedback, work.state)
+    advance(filters, _wheels(window, work, begin, stop, element_front, element_rear))
+
+
+@kernel
+def _wheels(
+    window: PaperWindow, work: Workspace, begin: int, stop: int, front: int, rear: int
+) -> WheelStretch:
+    """Return a stretch of both wheels, in the parts `front` and `rear`, over `work.road`."""
+    return WheelStretch(
+        front,
+        rear,
         window.place[0, begin:stop],
         window.place[1, begin:stop],
         work.force,
-        front[begin:stop],
-        rear[begin:stop],
+        work.road[0, begin:stop],
+        work.road[1, begin:stop],
     )
 
 
@@ -323,8 +328,7 @@ def march_particles(
                 return
     basis = window.basis
     if not modal_filters(
-        basis.stiffness,
-        basis.cubics,
+        basis,
         theta,
         window.step_s,
         work.matrix,
@@ -345,7 +349,7 @@ def march_particles(
     squares = (0.0, 0.0, 0.0, 0.0)
     for part in range(window.stretches.shape[0]):
         begin, stop, e1, e2 = window.stretches[part]
-        _march_stretch(window, work, factors, begin, stop, e1, e2, work.cubics, work.feedback)
+        _march_stretch(window, work, factors, begin, stop, e1, e2)
         for row in range(max(0, begin - window.first_row), min(rows, stop - window.first_row)):
             n = window.front_sample[row]
             w = window.front_weight[row]
@@ -446,8 +450,7 @@ def objective(window: PaperWindow, work: Workspace, theta: FloatArray) -> float:
     matrix = np.empty((modes, modes))
     vectors = np.empty((modes, modes))
     if not modal_filters_one(
-        basis.stiffness,
-        basis.cubics,
+        basis,
         theta,
         window.step_s,
         matrix,
@@ -456,6 +459,7 @@ def objective(window: PaperWindow, work: Workspace, theta: FloatArray) -> float:
         feedback,
     ):
         return np.inf
+    filters = ModalFilters(cubics, feedback, work.state)
     four = np.empty((LANES, theta.size))
     for lane in range(LANES):
         for i in range(theta.size):
@@ -474,19 +478,7 @@ def objective(window: PaperWindow, work: Workspace, theta: FloatArray) -> float:
     for part in range(window.stretches.shape[0]):
         begin, stop, e1, e2 = window.stretches[part]
         _one_particle_stretch(window, work, factors, begin, stop, scratch)
-        advance(
-            cubics[max(e1, 0)],
-            cubics[max(e2, 0)],
-            e1 >= 0,
-            e2 >= 0,
-            feedback,
-            work.state,
-            window.place[0, begin:stop],
-            window.place[1, begin:stop],
-            work.force,
-            front[begin:stop],
-            rear[begin:stop],
-        )
+        advance(filters, _wheels(window, work, begin, stop, e1, e2))
         for n in range(begin, stop):
             front[n, 0] = (front[n, 0] + front[n, 1]) + (front[n, 2] + front[n, 3])
             rear[n, 0] = (rear[n, 0] + rear[n, 1]) + (rear[n, 2] + rear[n, 3])

@@ -59,6 +59,27 @@ class BeamBasis(NamedTuple):
     lengths_m: FloatArray
 
 
+class ModalFilters(NamedTuple):
+    """The recursions of g modes or groups of modes; the last axis is particles or modes."""
+
+    cubics: FloatArray  # (parts, g, 4, 4): see `modal_filters`
+    feedback: FloatArray  # (g, factors, 4)
+    state: FloatArray  # (g, 2, 4)
+
+
+class WheelStretch(NamedTuple):
+    """A stretch of samples in which each wheel stays in one part of the bridge."""
+
+    front: int
+    """Part under the front wheel; -1 off the bridge."""
+    rear: int
+    front_place: FloatArray  # (steps,): 0..1 within the part
+    rear_place: FloatArray  # (steps,)
+    force: FloatArray  # (2, steps or more, 4)
+    front_deflection: FloatArray  # (steps, 4)
+    rear_deflection: FloatArray  # (steps, 4)
+
+
 def beam_basis(
     element_lengths_m: FloatArray,
     parts: int = 1,
@@ -151,8 +172,7 @@ def modal_damping(theta: FloatArray, eigenvalue: float) -> float:
 
 @kernel
 def modal_filters(
-    basis_stiffness: FloatArray,
-    basis_cubics: FloatArray,
+    basis: BeamBasis,
     theta: FloatArray,
     step_s: float,
     matrix: FloatArray,
@@ -165,6 +185,7 @@ def modal_filters(
     `theta` is (4, p). Outputs: `cubics` (parts, m, 4, 4) [part, mode, power, particle], scaled by
     1/sqrt(b_0), and `feedback` (m, 2, 4), the factors of w[n-2] and d[n-1].
     """
+    basis_stiffness, basis_cubics = basis.stiffness, basis.cubics
     factors, m = basis_stiffness.shape[0], basis_stiffness.shape[1]
     by_lane = np.empty((factors, LANES))
     for e in range(factors):
@@ -247,8 +268,7 @@ def shape_cubics(
 
 @kernel
 def modal_filters_one(
-    basis_stiffness: FloatArray,
-    basis_cubics: FloatArray,
+    basis: BeamBasis,
     theta: FloatArray,
     step_s: float,
     matrix: FloatArray,
@@ -261,12 +281,12 @@ def modal_filters_one(
     `matrix` and `vectors` are (m, m). Outputs: `cubics` (parts, g, 4, 4) [part, group, power, mode]
     and `feedback` (g, 2, 4); lanes beyond the last mode stay zero. Return False if not finite.
     """
-    if not diagonalise_bridge(basis_stiffness, theta, matrix, vectors):
+    if not diagonalise_bridge(basis.stiffness, theta, matrix, vectors):
         return False
     a = 2.0 / step_s
     cubics[:] = 0.0
     feedback[:] = 0.0
-    size = np.empty(basis_stiffness.shape[1])
+    size = np.empty(basis.stiffness.shape[1])
     for k in range(size.size):
         group, lane = k // LANES, k % LANES
         eigenvalue = matrix[k, k] / theta[RHO_A]
@@ -275,7 +295,7 @@ def modal_filters_one(
         feedback[group, 0, lane] = -4.0 * eigenvalue / b_0
         feedback[group, 1, lane] = (a * a - a * damping - 3.0 * eigenvalue) / b_0
         size[k] = 1.0 / np.sqrt(theta[RHO_A] * b_0)
-    shape_cubics(basis_cubics, vectors, size, cubics)
+    shape_cubics(basis.cubics, vectors, size, cubics)
     return True
 
 
@@ -285,19 +305,17 @@ def _one_mode_two_wheels(
     rear: FloatArray,
     feedback: FloatArray,
     state: FloatArray,
-    front_place: FloatArray,
-    rear_place: FloatArray,
-    force: FloatArray,
-    deflection_front: FloatArray,
-    deflection_rear: FloatArray,
+    wheels: WheelStretch,
 ) -> None:
+    front_place, rear_place = wheels.front_place, wheels.rear_place
+    deflection_front, deflection_rear = wheels.front_deflection, wheels.rear_deflection
     a0, a1, a2, a3 = load(front, 0), load(front, 1), load(front, 2), load(front, 3)
     b0, b1, b2, b3 = load(rear, 0), load(rear, 1), load(rear, 2), load(rear, 3)
     f1, f2 = load(feedback, 0), load(feedback, 1)
     w1, d = load(state, 0), load(state, 1)
     w2 = sub(w1, d)
     before = add(w1, w2)
-    force_front, force_rear = force[0], force[1]
+    force_front, force_rear = wheels.force[0], wheels.force[1]
     for n in range(front_place.size):
         x = front_place[n]
         z = rear_place[n]
@@ -347,43 +365,17 @@ def _one_mode_one_wheel(
 
 
 @kernel
-def advance(
-    front_cubics: FloatArray,
-    rear_cubics: FloatArray,
-    front_on: bool,
-    rear_on: bool,
-    feedback: FloatArray,
-    state: FloatArray,
-    front_place: FloatArray,
-    rear_place: FloatArray,
-    force: FloatArray,
-    deflection_front: FloatArray,
-    deflection_rear: FloatArray,
-) -> None:
-    """March all modes over a stretch in which each wheel stays in one element (or off the bridge).
-
-    Cubics are (m, 4, 4) of the element under each wheel, `feedback` and `state` (m, 2, 4), places
-    (steps,), `force` (2, steps, 4), deflections (steps, 4). `state` is updated and the deflections
-    are *added* to. The fourth axis may be particles or groups of modes.
-    """
+def advance(filters: ModalFilters, wheels: WheelStretch) -> None:
+    """March all modes over a stretch: `filters.state` is updated, deflections are *added* to."""
+    front = filters.cubics[max(wheels.front, 0)]
+    rear = filters.cubics[max(wheels.rear, 0)]
+    feedback, state, force = filters.feedback, filters.state, wheels.force
     for k in range(feedback.shape[0]):
-        if front_on and rear_on:
-            _one_mode_two_wheels(
-                front_cubics[k],
-                rear_cubics[k],
-                feedback[k],
-                state[k],
-                front_place,
-                rear_place,
-                force,
-                deflection_front,
-                deflection_rear,
-            )
-        elif front_on:
-            _one_mode_one_wheel(
-                front_cubics[k], feedback[k], state[k], front_place, force[0], deflection_front
-            )
-        elif rear_on:
-            _one_mode_one_wheel(
-                rear_cubics[k], feedback[k], state[k], rear_place, force[1], deflection_rear
-            )
+        if wheels.front >= 0 and wheels.rear >= 0:
+            _one_mode_two_wheels(front[k], rear[k], feedback[k], state[k], wheels)
+        elif wheels.front >= 0:
+            place, deflection = wheels.front_place, wheels.front_deflection
+            _one_mode_one_wheel(front[k], feedback[k], state[k], place, force[0], deflection)
+        elif wheels.rear >= 0:
+            place, deflection = wheels.rear_place, wheels.rear_deflection
+            _one_mode_one_wheel(rear[k], feedback[k], state[k], place, force[1], deflection)

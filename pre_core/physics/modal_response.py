@@ -15,17 +15,44 @@ frequency. Linear interpolation attenuates a force at omega by (omega h)^2/12; `
 restores this part.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.kernels.lanes import LANES, fma, fma_scalar, kernel, load, mul, store
 from pre_core.parameters import RHO_A
-from pre_core.physics.beam_basis import diagonalise_bridge, modal_damping, shape_cubics
+from pre_core.physics.beam_basis import (
+    BeamBasis,
+    ModalFilters,
+    diagonalise_bridge,
+    modal_damping,
+    shape_cubics,
+)
 
 FloatArray = NDArray[np.float64]
 
 COEFFICIENTS = 5
 """Number of coefficients of a mode: -a_1, -a_2 and b_0, b_1, b_2 over their sum."""
+
+
+class LoadedStretch(NamedTuple):
+    """A stretch of samples in which each wheel stays in one part of the bridge."""
+
+    front: int
+    """Part under the front wheel; -1 off the bridge."""
+    rear: int
+    place: FloatArray  # (2, steps): 0..1 within the part
+    force: FloatArray  # (2, steps or more, 4)
+    deflection: FloatArray  # (2, steps or more, 4)
+
+
+class EndStretch(NamedTuple):
+    """The ends of the bridge over a stretch of samples."""
+
+    force: FloatArray  # (2 ends, steps): acts in addition to the wheels' forces
+    share: FloatArray
+    """Share (2 wheels, 2 ends, steps) of an end's deflection that a wheel follows in addition."""
 
 
 @kernel
@@ -75,30 +102,29 @@ def mode_coefficients(eigenvalue: float, damping: float, step: float, out: Float
 
 @kernel
 def modal_filters(
-    basis_stiffness: FloatArray,
-    basis_cubics: FloatArray,
+    basis: BeamBasis,
     theta: FloatArray,
     step_s: float,
     matrix: FloatArray,
     vectors: FloatArray,
-    cubics: FloatArray,
-    feedback: FloatArray,
+    filters: ModalFilters,
     modes: FloatArray,
 ) -> bool:
     """Compute the recursions of the modes of one bridge `theta` (p,), g groups of four lanes.
 
-    `matrix` and `vectors` are (m, m). Outputs: `cubics` (parts, g, 4, 4) [part, group, power, mode]
-    times the root of the sum of the b; `feedback` (g, 5, 4), whose lanes beyond the last mode stay
-    zero; `modes` (m, 3): omega^2, damping, and the factor from the recursion's q to the coordinate
-    of the mass-normalised mode, with a sign that is the same for similar bridges. Return False if
-    not finite.
+    `matrix` and `vectors` are (m, m). Outputs: `filters.cubics` (parts, g, 4, 4) [part, group,
+    power, mode] times the root of the sum of the b; `filters.feedback` (g, 5, 4), whose lanes
+    beyond the last mode stay zero; `modes` (m, 3): omega^2, damping, and the factor from the
+    recursion's q to the coordinate of the mass-normalised mode, with a sign that is the same for
+    similar bridges. Return False if not finite.
     """
-    if not diagonalise_bridge(basis_stiffness, theta, matrix, vectors):
+    if not diagonalise_bridge(basis.stiffness, theta, matrix, vectors):
         return False
+    cubics, feedback = filters.cubics, filters.feedback
     cubics[:] = 0.0
     feedback[:] = 0.0
     one = np.empty(COEFFICIENTS)
-    size = np.empty(basis_stiffness.shape[1])
+    size = np.empty(basis.stiffness.shape[1])
     for k in range(size.size):
         group, lane = k // LANES, k % LANES
         eigenvalue = matrix[k, k] / theta[RHO_A]
@@ -111,7 +137,7 @@ def modal_filters(
         modes[k, 0], modes[k, 1] = eigenvalue, damping
         # In coordinates that diagonalise a similar bridge, a mode is nearly a unit vector.
         modes[k, 2] = np.sqrt(total) if vectors[k, k] >= 0.0 else -np.sqrt(total)
-    shape_cubics(basis_cubics, vectors, size, cubics)
+    shape_cubics(basis.cubics, vectors, size, cubics)
     return True
 
 
@@ -130,10 +156,9 @@ def _two_wheels(
     rear: FloatArray,
     feedback: FloatArray,
     state: FloatArray,
-    place: FloatArray,
-    force: FloatArray,
-    deflection: FloatArray,
+    wheels: LoadedStretch,
 ) -> None:
+    place, force, deflection = wheels.place, wheels.force, wheels.deflection
     a0, a1, a2, a3 = load(front, 0), load(front, 1), load(front, 2), load(front, 3)
     b0, b1, b2, b3 = load(rear, 0), load(rear, 1), load(rear, 2), load(rear, 3)
     f1, f2 = load(feedback, 0), load(feedback, 1)
@@ -196,40 +221,18 @@ def _no_wheel(feedback: FloatArray, state: FloatArray, steps: int) -> None:
 
 
 @kernel
-def advance(
-    cubics: FloatArray,
-    part_front: int,
-    part_rear: int,
-    feedback: FloatArray,
-    state: FloatArray,
-    place: FloatArray,
-    force: FloatArray,
-    deflection: FloatArray,
-) -> None:
-    """March all modes over a stretch in which each wheel stays in one part (-1: off the bridge).
-
-    `cubics` (parts, g, 4, 4), `feedback` (g, 5, 4), `state` (g, 2, 4), `place` (2, steps), `force`
-    (2, steps, 4), `deflection` (2, steps, 4). `state` is updated, the deflections are *added* to.
-    """
+def advance(filters: ModalFilters, wheels: LoadedStretch) -> None:
+    """March all modes over a stretch: `filters.state` is updated, deflections are *added* to."""
+    cubics, feedback, state = filters.cubics, filters.feedback, filters.state
+    place, force, deflection = wheels.place, wheels.force, wheels.deflection
+    front, rear = wheels.front, wheels.rear
     for g in range(feedback.shape[0]):
-        if part_front >= 0 and part_rear >= 0:
-            _two_wheels(
-                cubics[part_front, g],
-                cubics[part_rear, g],
-                feedback[g],
-                state[g],
-                place,
-                force,
-                deflection,
-            )
-        elif part_front >= 0:
-            _one_wheel(
-                cubics[part_front, g], feedback[g], state[g], place[0], force[0], deflection[0]
-            )
-        elif part_rear >= 0:
-            _one_wheel(
-                cubics[part_rear, g], feedback[g], state[g], place[1], force[1], deflection[1]
-            )
+        if front >= 0 and rear >= 0:
+            _two_wheels(cubics[front, g], cubics[rear, g], feedback[g], state[g], wheels)
+        elif front >= 0:
+            _one_wheel(cubics[front, g], feedback[g], state[g], place[0], force[0], deflection[0])
+        elif rear >= 0:
+            _one_wheel(cubics[rear, g], feedback[g], state[g], place[1], force[1], deflection[1])
         else:  # a span shorter than the wheelbase vibrates freely between the axles
             _no_wheel(feedback[g], state[g], place.shape[1])
 
@@ -270,20 +273,14 @@ def add_free_vibration(
 
 @kernel
 def _group_with_ends(
-    front: FloatArray,
-    rear: FloatArray,
-    first: FloatArray,
-    last: FloatArray,
-    front_on: bool,
-    rear_on: bool,
-    feedback: FloatArray,
-    state: FloatArray,
-    place: FloatArray,
-    force: FloatArray,
-    end_force: FloatArray,
-    end_share: FloatArray,
-    deflection: FloatArray,
+    filters: ModalFilters, g: int, wheels: LoadedStretch, ends: EndStretch
 ) -> None:
+    cubics, feedback, state = filters.cubics, filters.feedback[g], filters.state[g]
+    front, rear = cubics[max(wheels.front, 0), g], cubics[max(wheels.rear, 0), g]
+    first, last = cubics[0, g], cubics[cubics.shape[0] - 1, g]
+    front_on, rear_on = wheels.front >= 0, wheels.rear >= 0
+    place, force, deflection = wheels.place, wheels.force, wheels.deflection
+    end_force, end_share = ends.force, ends.share
     for lane in range(LANES):
         f1, f2 = feedback[0, lane], feedback[1, lane]
         n0, n1, n2 = feedback[2, lane], feedback[3, lane], feedback[4, lane]
@@ -316,37 +313,7 @@ def _group_with_ends(
 
 
 @kernel
-def advance_with_ends(
-    cubics: FloatArray,
-    part_front: int,
-    part_rear: int,
-    feedback: FloatArray,
-    state: FloatArray,
-    place: FloatArray,
-    force: FloatArray,
-    end_force: FloatArray,
-    end_share: FloatArray,
-    deflection: FloatArray,
-) -> None:
-    """March as `advance` does, with forces at both ends of the bridge, whose motion wheels follow.
-
-    `end_force` (2 ends, steps) acts in addition to the wheels' forces; `end_share` (2 wheels, 2
-    ends, steps) is the share of an end's deflection that a wheel follows in addition to that at its
-    place.
-    """
-    for g in range(feedback.shape[0]):
-        _group_with_ends(
-            cubics[max(part_front, 0), g],
-            cubics[max(part_rear, 0), g],
-            cubics[0, g],
-            cubics[cubics.shape[0] - 1, g],
-            part_front >= 0,
-            part_rear >= 0,
-            feedback[g],
-            state[g],
-            place,
-            force,
-            end_force,
-            end_share,
-            deflection,
-        )
+def advance_with_ends(filters: ModalFilters, wheels: LoadedStretch, ends: EndStretch) -> None:
+    """March as `advance` does, with forces at the ends, whose motion the wheels follow."""
+    for g in range(filters.feedback.shape[0]):
+        _group_with_ends(filters, g, wheels, ends)

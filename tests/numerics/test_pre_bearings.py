@@ -24,7 +24,7 @@ from pre_core.kernels.lanes import LANES
 from pre_core.paper import experiment
 from pre_core.parameters import C_U1, F
 from pre_core.physics import modal_response
-from pre_core.physics.beam_basis import RIGID_M_PER_N, beam_basis, change_basis
+from pre_core.physics.beam_basis import RIGID_M_PER_N, ModalFilters, beam_basis, change_basis
 from pre_core.physics.bridge import Beam, interpolation_matrix, modes, refine
 from pre_core.physics.models import beam_from, from_models
 from pre_core.physics.vehicle import body_masses_kg, total_mass_kg
@@ -247,14 +247,12 @@ def filters(theta: FloatArray, lengths: FloatArray, interior: tuple[int, ...]) -
     cubics, feedback = np.zeros((parts, groups, 4, LANES)), np.zeros((groups, 5, LANES))
     found = np.zeros((m, 3))
     assert modal_response.modal_filters(
-        basis.stiffness,
-        basis.cubics,
+        basis,
         theta,
         3e-3,
         np.zeros((m, m)),
         np.zeros((m, m)),
-        cubics,
-        feedback,
+        ModalFilters(cubics, feedback, np.zeros((groups, 2, LANES))),
         found,
     )
     return Filters(cubics, feedback, found, np.concatenate([[0.0], np.cumsum(basis.lengths_m)]))
@@ -315,14 +313,10 @@ def test_free_decay_of_a_mode(k: int, alpha_per_s: float) -> None:
     modal_response.add_free_vibration(ours.feedback, state, ours.modes[k], k, q, v)
     lanes = np.zeros((2, steps, LANES))
     modal_response.advance(
-        ours.cubics,
-        4,
-        -1,
-        ours.feedback,
-        state,
-        np.full((2, steps), 0.3),
-        np.zeros((2, steps, LANES)),
-        lanes,
+        ModalFilters(ours.cubics, ours.feedback, state),
+        modal_response.LoadedStretch(
+            4, -1, np.full((2, steps), 0.3), np.zeros((2, steps, LANES)), lanes
+        ),
     )
     cubic = ours.cubics[4, k // LANES, :, k % LANES]
     shape = np.sum(cubic * 0.3 ** np.arange(4)) / ours.modes[k, 2]
