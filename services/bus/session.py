@@ -43,8 +43,13 @@ from services.common.files import read_bytes
 
 _log = logging.getLogger(__name__)
 _ENDPOINT = re.compile(r"(tcp|tls|quic|ws|unixsock-stream)/\S+")
-_CONNECT_TRY_MS = 500
-"""Duration of an attempt, short enough to handle a signal between two."""
+_CONNECT_MS = 10_000
+"""Limit of an attempt: a handshake takes four round trips, more where packets are lost."""
+_ONCE = "retry_period_init_ms=0"
+"""Setting of an endpoint that is tried once: a refused attempt ends at once, so that Python can
+handle a signal before the next one. Zenoh would repeat it until the limit."""
+_PAUSE_S = 0.1
+"""Pause between attempts that are refused at once."""
 _CONNECT_S = 1.0
 """Duration of attempts before `is_over` is checked again."""
 _PATIENCE_WITH_SUBSCRIBER_US = 1_000_000
@@ -66,7 +71,8 @@ def open_session(
 ) -> zenoh.Session:
     """Open a session: a client of the router at `connect`, or a router that listens at `listen`.
 
-    A client waits `timeout_s` (None: for ever) for the router and reconnects by itself after the
+    A client waits `timeout_s` (None: for ever) for the router, and up to 10 s longer for the end of
+    an attempt if the network neither connects nor refuses. It reconnects by itself after the
     connection is lost. It must be closed, or the process does not end; it is a context manager.
 
     `tls` is a folder of `driveby certs`: both sides authenticate, only TLS is used, and the
@@ -101,6 +107,7 @@ def open_session(
             # Zenoh could wait by itself, but Python would handle no signal meanwhile.
             if time.monotonic() >= deadline:
                 raise FailureError(_why_not_connected(endpoint, timeout_s, tls)) from None
+            time.sleep(_PAUSE_S)
 
 
 def wait_for_router(
@@ -142,9 +149,9 @@ def _configuration(endpoint: str, tls: Path | None, *, is_client: bool) -> zenoh
     config = zenoh.Config()
     settings: dict[str, Any] = {
         "mode": "client" if is_client else "router",
-        "connect/endpoints": [endpoint] if is_client else [],
+        "connect/endpoints": [_once(endpoint)] if is_client else [],
         "listen/endpoints": [] if is_client else [endpoint],
-        "connect/timeout_ms": _CONNECT_TRY_MS,
+        "connect/timeout_ms": _CONNECT_MS,
         "connect/retry": {
             "period_init_ms": 100,
             "period_max_ms": 500,
@@ -164,6 +171,10 @@ def _configuration(endpoint: str, tls: Path | None, *, is_client: bool) -> zenoh
     if tls is not None:
         _add_security(config, tls.absolute(), is_client=is_client)
     return config
+
+
+def _once(endpoint: str) -> str:
+    return f"{endpoint}{';' if '#' in endpoint else '#'}{_ONCE}"
 
 
 def _add_security(config: zenoh.Config, tls: Path, *, is_client: bool) -> None:

@@ -75,6 +75,9 @@ _COMPLAINT_PERIOD_S = 60.0
 """Interval of log lines about a failing disk, which fails at every message."""
 _CONNECT_PAUSE_S = 0.2
 """Pause between two attempts, each of which may fail at once."""
+_FIRST_ANSWER_S = 1.0
+"""Wait for the first attempt; the truck then records while it goes on."""
+_MEANWHILE = "all messages go to the spool meanwhile"
 Connect = Callable[[], zenoh.Session]
 """Open a session; raise FailureError if there is no answer now."""
 
@@ -94,8 +97,8 @@ class Gateway:
     ) -> None:
         """Join the bus. With a spool, `session` may be a function that opens one.
 
-        It is called at once, and after a FailureError again repeatedly by a thread, while the spool
-        already accepts messages. The gateway closes a session that it has opened.
+        A thread calls it at once, and after a FailureError repeatedly; the spool accepts messages
+        after a second at the latest. The gateway closes a session that it has opened.
         """
         self.vehicle = check_identifier(vehicle)
         self.log = logging.LoggerAdapter(_log, about(realm=realm, vehicle=vehicle))
@@ -115,21 +118,22 @@ class Gateway:
         self._spool = None if spool is None else _SpoolService(self, spool)
         self._closing = threading.Event()
         self._connecting: threading.Thread | None = None
+        self._answered = threading.Event()
+        self._failed: Exception | None = None
         if isinstance(session, zenoh.Session):
             self._join(session)
             return
         if spool is None:
             raise ValueError("without a spool a session is needed")
-        try:
-            self._own_session = session()
-        except FailureError as error:
-            self.log.warning("%s: %s; all messages go to the spool meanwhile", vehicle, error)
-            self._connecting = threading.Thread(
-                target=self._connect, args=(session,), name="connect", daemon=True
-            )
-            self._connecting.start()
-        else:
-            self._join(self._own_session)
+        self._connecting = threading.Thread(
+            target=self._connect, args=(session,), name="connect", daemon=True
+        )
+        self._connecting.start()
+        if not self._answered.wait(_FIRST_ANSWER_S):
+            self._answered.set()
+            self.log.warning("%s: no router has answered yet; %s", vehicle, _MEANWHILE)
+        elif self._failed is not None:
+            raise self._failed
 
     @property
     def boot_id(self) -> int:
@@ -215,16 +219,25 @@ class Gateway:
 
     def _connect(self, connect: Connect) -> None:
         while not self._closing.is_set():
+            is_late = self._answered.is_set()
             try:
                 self._own_session = connect()
-            except FailureError:
+                self._join(self._own_session)
+            except FailureError as error:
+                if not is_late:
+                    self.log.warning("%s: %s; %s", self.vehicle, error, _MEANWHILE)
+                    self._answered.set()
                 self._closing.wait(_CONNECT_PAUSE_S)
-            except Exception:  # an unattended truck continues without this thread
-                self.log.exception("%s: connecting failed for good", self.vehicle)
+            except Exception as error:
+                if is_late:  # an unattended truck continues without this thread
+                    self.log.exception("%s: connecting failed for good", self.vehicle)
+                self._failed = error
+                self._answered.set()
                 return
             else:
-                self._join(self._own_session)
-                self.log.info("%s: connected", self.vehicle)
+                if self._answered.is_set():
+                    self.log.info("%s: connected", self.vehicle)
+                self._answered.set()
                 return
 
     def _join(self, session: zenoh.Session) -> None:

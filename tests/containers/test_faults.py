@@ -7,12 +7,10 @@ once, and every crossing that a truck has driven to its end has one result.
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
-from schemas.topics import Key
-from services.recordings.recording import read_messages
+from tests.containers.recorded import Drive, check_complete, drives_of
 from tests.containers.stack import Faults, Stack, gone_at_the_end, until
 
 pytestmark = [pytest.mark.containers, pytest.mark.timeout(7200)]
@@ -20,39 +18,10 @@ pytestmark = [pytest.mark.containers, pytest.mark.timeout(7200)]
 STRUCK = ["logger", "router", "worker", "truck"]
 
 
-class Drive(NamedTuple):
-    """One start of a truck, as the logger has recorded it."""
-
-    begin_s: float
-    end_s: float
-    fixes: int
-
-
 @pytest.fixture
 def stack(engine: None) -> Iterator[Stack]:
     with gone_at_the_end(Stack("driveby-faults")) as made:
         yield made
-
-
-def numbers_of(folder: Path) -> dict[tuple[Key, int], list[int]]:
-    found: dict[tuple[Key, int], list[int]] = {}
-    for path in folder.rglob("*truck-1*.mcap"):
-        for message in read_messages(path):
-            if message.key.owner == "vehicle" and message.key.stream != "info":
-                found.setdefault((message.key, message.boot_id), []).append(message.sequence)
-    return found
-
-
-def drives_of(folder: Path) -> dict[int, Drive]:
-    times: dict[int, list[int]] = {}
-    for path in folder.rglob("*truck-1*.mcap"):
-        for message in read_messages(path):
-            if message.key.stream == "gnss":
-                times.setdefault(message.boot_id, []).append(message.log_time_ns)
-    return {
-        boot: Drive(min(found) * 1e-9, max(found) * 1e-9, len(found))
-        for boot, found in times.items()
-    }
 
 
 def test_nothing_is_lost_nothing_twice_and_one_result_for_each_crossing(
@@ -97,8 +66,7 @@ def test_nothing_is_lost_nothing_twice_and_one_result_for_each_crossing(
         )
 
     until(is_identified, "a result for each whole drive")
-    for name, found in numbers_of(stack.take("recordings", folder / "last")).items():
-        assert sorted(found) == list(range(len(found))), (name, len(found))
+    check_complete(stack.take("recordings", folder / "last"))
     results = stack.results(folder / "all")
     names = [one["crossing_id"] for one in results]
     assert len(names) == len(set(names))

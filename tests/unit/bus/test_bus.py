@@ -24,6 +24,7 @@ from services.bus.subscription import (
     subscribe_latest,
 )
 from services.common.errors import FailureError, InputError
+from tests.slow_proxy import slow_proxy
 from tests.waiting import LONGEST_S, until
 
 ACCEL = Key("live", "vehicle", "truck-1", "accel")
@@ -228,6 +229,22 @@ def test_without_a_logger_delivery_only_lingers(delivery: DeliveryTracker) -> No
 def test_nobody_answers(endpoint: str) -> None:
     with pytest.raises(FailureError, match=rf"^no router answers at {endpoint} within 0\.5 s"):
         open_session(connect=endpoint, timeout_s=0.5)
+
+
+def test_client_connects_over_a_slow_link(router: zenoh.Session, endpoint: str) -> None:
+    """And again after it was cut; a handshake over it takes more than a second."""
+    with slow_proxy(endpoint, 0.3) as proxy:
+        client = open_session(connect=proxy.endpoint, timeout_s=0.0)
+        publisher = Publisher(client, "live")
+        with Subscription(router, selector("live", "vehicle")) as subscription:
+            put_all(publisher, [b"0"])
+            receive(subscription, 1)
+            proxy.cut()
+            put_all(publisher, [b"1"])
+            [found] = receive(subscription, 1)
+            assert found.payload == b"1"
+        publisher.close()
+        client.close()
 
 
 def test_the_address_is_taken(router: zenoh.Session, endpoint: str) -> None:
