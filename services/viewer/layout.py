@@ -181,7 +181,7 @@ def _rigidity_layout(root: str, crossing: CrossingView) -> rrb.Container:
     along = rrb.Tabs(
         rrb.Spatial2DView(
             origin=f"{root}/strip",
-            name=f"{doubt}EI / nominal, 95 % interval",
+            name=f"{doubt}EI / nominal" if doubt else "EI / nominal, 95 % interval",
             background=STRIP_PAPER,
             visual_bounds=rrb.VisualBounds2D(
                 x_range=(-20.0, STRIP_WIDTH + 150.0), y_range=(-20.0, STRIP_HEIGHT + 150.0)
