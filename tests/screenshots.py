@@ -63,7 +63,12 @@ SHOTS = (
     Shot("view-rejected", "rejected.rrd", ("2026-01-01",), None),
 )
 
-
+PICTURES = {
+    "picture-bridge": "good/bridge-1.png",
+    "picture-suspect": "suspect/truck-1.*.png",
+    "picture-rejected": "rejected/truck-1.*.png",
+}
+"""Pictures of `identify --figures`."""
 SHARED = ROOT.parent / "shared/crossings"
 """Crossings of an independent simulator, which are not in the repository."""
 OF_SHARED = {
@@ -84,6 +89,8 @@ def main() -> int:
             shot.name: partial(take, shot, folder) for shot in SHOTS
         }
         takers["report"] = partial(take_report, folder)
+        for shown, pattern in PICTURES.items():
+            takers[shown] = partial(take_picture, folder, pattern)
         of_sample = set(takers)
         takers["demo"] = partial(take_demo, folder)
         takers["watch"] = partial(take_terminal, folder, columns=100)
@@ -111,11 +118,13 @@ def make_files(folder: Path) -> None:
     louder = folder / "louder.toml"
     louder.write_text(re.sub(r"(?m)^noise_density_.*$", "noise_density_ug_per_rthz = 60.0", toml))
     for name, options in (("good", ()), ("suspect", ("--site", str(louder)))):
-        outputs = ("--rrd", f"{folder / name}.rrd", "--json", f"{folder / name}.json")
+        outputs = ["--rrd", f"{folder / name}.rrd", "--json", f"{folder / name}.json"]
+        outputs += ["--figures", str(folder / name)]
         assert cli.main(["identify", str(SAMPLE), *outputs, *options]) == 0
     write_recording(folder / "gap.mcap", with_a_gap(), site_toml=toml, reason="a gap")
     rejected = str(folder / "rejected.rrd")
-    assert cli.main(["identify", str(folder / "gap.mcap"), "--rrd", rejected]) == 0
+    figures = ["--figures", str(folder / "rejected")]
+    assert cli.main(["identify", str(folder / "gap.mcap"), "--rrd", rejected, *figures]) == 0
 
 
 def with_a_gap() -> Iterator[Message]:
@@ -126,6 +135,12 @@ def with_a_gap() -> Iterator[Message]:
     for one in messages:
         if one.key.stream != "accel" or abs(one.log_time_ns - middle) > 150_000_000:
             yield one
+
+
+def take_picture(folder: Path, pattern: str) -> bytes:
+    """The picture that `identify --figures` wrote."""
+    (path,) = folder.glob(pattern)
+    return path.read_bytes()
 
 
 def take_shared(name: str, folder: Path) -> bytes:

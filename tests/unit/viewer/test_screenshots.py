@@ -16,7 +16,7 @@ from tests.viewer_screen import has_driver, pixels
 def test_every_picture_is_there_small_and_named_on_the_page(project: Path) -> None:
     page = (project / "docs/output.md").read_text()
     shots = [shot.name for shot in (*screenshots.SHOTS, *screenshots.OF_SHARED.values())]
-    others = ["view-live", "view-live-result", "watch", "report"]
+    others = ["view-live", "view-live-result", "watch", "report", *screenshots.PICTURES]
     for name in shots + others:
         assert (screenshots.FOLDER / f"{name}.png").stat().st_size < screenshots.MAX_BYTES
         assert f"(images/{name}.png)" in page
