@@ -156,10 +156,13 @@ def normalised_runs(
     site_name: str,
     vehicle_id: str,
     how: HowToRead = AS_WRITTEN,
+    *,
+    checks_rate: bool = True,
 ) -> list[Run]:
     """Return the runs of a folder or of a pair of CSV files, upward and without gravity.
 
-    Without a site the form of the measurements is unknown, and they stay as in the file.
+    Without a site the form of the measurements is unknown, and they stay as in the file. A rate
+    other than the declared one raises InputError if `checks_rate`.
     """
     if len(sources) == 1 and is_comma2k19(sources[0]):
         return [read_comma2k19(sources[0])]  # its axes and its rate are known
@@ -168,7 +171,7 @@ def normalised_runs(
     vehicle = site.vehicle(vehicle_id)
     runs = csv_runs(sources, site, vehicle_id, how)
     declared = tuple(rates_hz(site.sensor, vehicle).values())
-    for run in runs:
+    for run in runs if checks_rate else ():
         _check_rate(run, declared, site_name)
     return [normalised(run, middle_sensor(site.sensor, vehicle)) for run in runs]
 

@@ -13,12 +13,9 @@ from schemas.site import Site
 from schemas.topics import Message
 from services.common.errors import InputError
 from services.common.progress import Offset, no_progress
-from services.drives.comma2k19 import is_comma2k19, read_comma2k19
-from services.drives.csv_runs import csv_runs
-from services.drives.importing import vehicle_of
-from services.drives.runs import normalised, run_to_messages
+from services.drives.importing import normalised_runs, vehicle_of
+from services.drives.runs import run_to_messages
 from services.finding.drive import DriveMessages, drives_of
-from services.finding.placed import middle_sensor
 from services.finding.streams import Boot, Fixes, Samples, boot_of
 from services.recordings.recording import read_messages
 
@@ -85,12 +82,7 @@ def recorded_runs(
 def _of_folder(folder: Path, site: Site, site_name: str) -> Iterator[Message]:
     """Yield the messages as `driveby import` would read them; the check judges the rates."""
     vehicle_id = vehicle_of(site, site_name, None)
-    if is_comma2k19(folder):
-        runs = [read_comma2k19(folder)]
-    else:
-        vehicle = site.vehicle(vehicle_id)
-        sensor = middle_sensor(site.sensor, vehicle)
-        runs = [normalised(run, sensor) for run in csv_runs([folder], site, vehicle_id)]
+    runs = normalised_runs([folder], site, site_name, vehicle_id, checks_rate=False)
     return run_to_messages(runs, site, _REALM, vehicle_id)
 
 

@@ -14,6 +14,8 @@ from schemas.signals import CHANNELS, decode_accel, decode_gnss, encode_accel, e
 from schemas.site import Site
 from schemas.site_file import site_toml
 from schemas.topics import Message
+from services.common.errors import InputError
+from services.drives.importing import normalised_runs
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.inspection.finding import CheckFinding, CheckStatus
 from services.inspection.inspect import findings_of_run
@@ -115,6 +117,16 @@ def test_missing_channels_samples_and_rates(tmp_path: Path) -> None:
     other = case.site.model_copy(update={"sensor": sensor})
     (found,) = findings(tmp_path, run, other)["sampling_rate"]
     assert found.text.startswith(f"{U2}: 1000.0 samples a second, 2000 declared")
+
+
+def test_folder_of_another_rate_is_checked_but_not_imported() -> None:
+    folder = Path(__file__).parents[2] / "data" / "csv_example"
+    site = sound().site
+    assert site.sensor.rate_hz != (100.0,) * 4
+    with pytest.raises(InputError, match="gives a rate of 100 Hz"):
+        normalised_runs([folder], site, "site.toml", site.vehicles[0].id)
+    (run,) = recorded_runs(folder, site, "site.toml")
+    assert run.rates_hz == pytest.approx(dict.fromkeys(CHANNELS, 100.0))
 
 
 def test_receiver_that_is_not_as_declared(tmp_path: Path) -> None:
