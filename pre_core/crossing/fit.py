@@ -42,6 +42,10 @@ _CLEAR_FRICTION_WEIGHT = 0.05
 _NO_FIT_CHI2 = 10.0
 """Limit of chi2 at five times the noise: right starts of 90 drawn crossings had 1.6 at most, wrong
 ones 10 to 70."""
+_POOR_START_CHI2, WORTH_COMPLETING_CHI2 = 1.7, 5.0
+"""Values of chi2 at five times the noise above which a fit is left unfinished until the other
+offsets were tried, and is not completed before other strategies either. Accepted fits had 1.7 at
+most, and one of 50 had 3.7; sound crossings with mismatch had 2 to 20 without it."""
 FAR_OFF_CHI2 = 200.0
 """Value of chi2 at five times the noise, with reduced suspension weight, above which the fit is not
 continued, and of a first fit, above which no other offset is tried: sound crossings had 13 at most
@@ -61,7 +65,7 @@ _SAME_LEVEL = 0.1
 _CLEAR_MISFIT = 5.0
 """Mean square of residuals and priors, with reduced suspension weight, above which a minimum need
 not be exact."""
-_SMALL_GAIN, _CLEAR_MISFIT_CHI2 = 0.05, 2.0
+SMALL_GAIN, _CLEAR_MISFIT_CHI2 = 0.05, 2.0
 """Relative reduction of chi2 below which no other noise or offset is tried at a clear misfit, and
 the chi2 of such a misfit. Of 16 sound crossings with mismatch, fits without it from four offsets
 had 1.9 to 12, within 12 % of each other."""
@@ -103,6 +107,8 @@ class Optimum(NamedTuple):
     """Whether a search with full suspension weight was abandoned for clear friction."""
     differs: bool = False
     """Whether a search without mismatch was abandoned for a clear one."""
+    unfinished: SearchStrategy | None = None
+    """Strategy of a fit whose first stage ended at a poor start: `complete_fit` continues it."""
     noise_power: float = 1.0
     """Noise power ratio where it clearly exceeds one, which resembles friction and mismatch. Up to
     `HOPELESS_NOISE` the fit used it."""
@@ -199,7 +205,7 @@ def is_accepted(problem: PosteriorProblem, chi2: float) -> bool:
 
 def is_better_misfit(chi2: float, last: float) -> bool:
     """Return whether a fit of this chi2 is worth another one after a fit of chi2 `last`."""
-    return chi2 <= max(_CLEAR_MISFIT_CHI2, (1.0 - _SMALL_GAIN) * last)
+    return chi2 <= max(_CLEAR_MISFIT_CHI2, (1.0 - SMALL_GAIN) * last)
 
 
 class AbandonReason(Enum):
@@ -230,7 +236,7 @@ def fit_all(
     start = y.copy()
     start[layout(problem).swing] = 0.0
     free = np.eye(start.size)
-    first = np.delete(free, resting_mode_indices(problem, strategy), axis=1)
+    first = _first_directions(problem, strategy)
     at_full_weight = _at_full_weight(problem, start)
     at_full_weight, y, ending, evaluations = fit_stage(
         at_full_weight, start, first, _FREE_STAGES[0], _at_full_weight
@@ -242,11 +248,44 @@ def fit_all(
         return AbandonReason.CLEAR_FRICTION, evaluations
     if strategy.uses_suspension and chi2_per_dof(at_full_weight, y) > _NO_FIT_CHI2:
         return AbandonReason.NO_FIT, evaluations
-    if has_friction or (problem.force.any() and not strategy.uses_suspension):
+    is_reduced = has_friction or (problem.force.any() and not strategy.uses_suspension)
+    problem = at_full_weight
+    if is_reduced:
         problem = update_noise(at_full_weight, start)
         problem, y, ending, used = fit_stage(problem, start, free, _FREE_STAGES[0], update_noise)
         evaluations += used
+    if chi2_per_dof(problem, y) > _POOR_START_CHI2:
+        found = _optimum_at(problem, y, ending)._replace(unfinished=strategy)
     else:
+        found = _completed(problem, y, strategy)
+    evaluations += found.evaluations
+    return found._replace(evaluations=evaluations), evaluations
+
+
+def _first_directions(problem: PosteriorProblem, strategy: SearchStrategy) -> FloatArray:
+    """Return the directions (f, d) of a first fit, with the highest modes at rest."""
+    free = np.eye(layout(problem).size)
+    return np.delete(free, resting_mode_indices(problem, strategy), axis=1)
+
+
+def complete_fit(found: Optimum) -> Optimum:
+    """Return the optimum to which an unfinished one leads; the same if it is finished."""
+    if found.unfinished is None:
+        return found
+    there = _completed(found.problem, found.state.y, found.unfinished)
+    return there._replace(
+        evaluations=found.evaluations + there.evaluations,
+        starts=found.starts,
+        noise_power=found.noise_power,
+    )
+
+
+def _completed(problem: PosteriorProblem, y: FloatArray, strategy: SearchStrategy) -> Optimum:
+    """Return the optimum to which y (size,) leads after the first stage."""
+    ending, evaluations = Termination.STEPS_EXHAUSTED, 0
+    free = np.eye(y.size)
+    if not problem.force.any():
+        first = _first_directions(problem, strategy)
         for is_free, rounds in ((True, _EARLY_ROUNDS), (False, _MAX_ROUNDS)):
             y = y if is_free else _not_negative(problem, y)
             problem = _at_full_weight(problem, y)
@@ -266,9 +305,14 @@ def fit_all(
     if problem.force.any():
         problem, y, ending, used = _fit_at_misfit(problem, y, free)
         evaluations += used
+    found = _optimum_at(problem, y, ending)
+    return found._replace(evaluations=evaluations + found.evaluations)
+
+
+def _optimum_at(problem: PosteriorProblem, y: FloatArray, ending: Termination) -> Optimum:
+    """Return the optimum at y, of one start, with the evaluations of its Jacobian."""
     state = levenberg_marquardt.initial_state(lambda at: all_rows(problem, at), y)
-    found = Optimum(problem, state, ending, chi2_per_dof(problem, y), evaluations, 1)
-    return found, evaluations + y.size + 1
+    return Optimum(problem, state, ending, chi2_per_dof(problem, y), y.size + 1, 1)
 
 
 def _at_full_weight(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:

@@ -12,14 +12,19 @@ bridge placed half a metre too far fits almost as well with other rigidities. So
 If the result is a misfit because of hum, the search is repeated without the hum (`lines`).
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pre_core.crossing.fit import (
     FAR_OFF_CHI2,
     HOPELESS_CHI2,
+    SMALL_GAIN,
+    WORTH_COMPLETING_CHI2,
     AbandonReason,
     Optimum,
     SearchStrategy,
+    complete_fit,
     fit_all,
     fit_stage,
     is_accepted,
@@ -89,6 +94,15 @@ found all but one, which the second did. Strategies with mismatch precede the ot
 residuals off the bridge show it."""
 
 
+class _Budget(NamedTuple):
+    """Limits of the search by one strategy."""
+
+    evaluations: int
+    """Number after which no other candidate is tried."""
+    chi2: float
+    """Value of chi2 above which an unfinished fit is not completed."""
+
+
 def _whole_bridge(problem: PosteriorProblem, strategy: SearchStrategy) -> FloatArray:
     """Return directions in which all elements change together, without restraint and compliance."""
     where = layout(problem)
@@ -129,13 +143,20 @@ def _evaluations_of_all(found: list[Optimum]) -> int:
 def _run_strategies(
     problem: PosteriorProblem, y: FloatArray, report: Report, max_evaluations: int
 ) -> list[Optimum]:
-    """Return the optima of the strategies, up to the first that is final or shows a line."""
+    """Return the optima of the strategies, up to the first that is final or shows a line.
+
+    If there is none, the best one is fitted to its end.
+    """
     simplest = _SIMPLEST
     if has_tandem(problem):
         simplest = _WITH_MISMATCH[0 if problem.crossing.lead.is_equalised else 1]
-    found = [_refine_candidates(problem, y, simplest, report, max_evaluations)]
+    budget = _Budget(max_evaluations, WORTH_COMPLETING_CHI2)
+    found = [_refine_candidates(problem, y, simplest, report, budget)]
     if not _has_ended(found[0]):
         found += _try_other_strategies(problem, y, found[0], report, max_evaluations)
+    best = min(range(len(found)), key=lambda k: found[k].chi2_per_dof)
+    if found[best].chi2_per_dof <= HOPELESS_CHI2 and not _has_ended(found[-1]):
+        found.append(complete_fit(found.pop(best)))
     return found
 
 
@@ -164,14 +185,23 @@ def _try_other_strategies(
     for strategy in strategies:
         if has_friction and strategy.uses_suspension:
             continue
-        evaluations_left = max_evaluations - _evaluations_of_all([first, *found])
-        if evaluations_left <= 0:
+        budget = _budget_left(max_evaluations, [first, *found])
+        if budget.evaluations <= 0:
             break
-        found.append(_refine_candidates(problem, y, strategy, report, evaluations_left))
+        found.append(_refine_candidates(problem, y, strategy, report, budget))
         has_friction = found[-1].stopped_by_friction
         if _has_ended(found[-1]):
             break
     return found
+
+
+def _budget_left(max_evaluations: int, found: list[Optimum]) -> _Budget:
+    """Return the budget of another strategy after those that ended at `found`."""
+    reached = min((one.chi2_per_dof for one in found if one.unfinished is None), default=np.inf)
+    return _Budget(
+        max_evaluations - _evaluations_of_all(found),
+        min(WORTH_COMPLETING_CHI2, (1.0 - SMALL_GAIN) * reached),
+    )
 
 
 def _is_final(found: Optimum) -> bool:
@@ -185,11 +215,11 @@ def _refine_candidates(
     y: FloatArray,
     strategy: SearchStrategy,
     report: Report,
-    max_evaluations: int,
+    budget: _Budget,
 ) -> Optimum:
     """Return the best optimum of a strategy; none, as without finite numbers, if it diverges."""
     try:
-        return _refine_likeliest(problem, y, strategy, report, max_evaluations)
+        return _refine_likeliest(problem, y, strategy, report, budget)
     except (FloatingPointError, np.linalg.LinAlgError):
         return _no_optimum(problem, y, 0, 0)
 
@@ -199,12 +229,12 @@ def _refine_likeliest(
     y: FloatArray,
     strategy: SearchStrategy,
     report: Report,
-    max_evaluations: int,
+    budget: _Budget,
 ) -> Optimum:
     """Return the best optimum reached from the most likely offsets.
 
     There is none, as without finite residuals, as soon as a candidate shows that the strategy is
-    wrong. After `max_evaluations` evaluations no other candidate is tried.
+    wrong.
     """
     force = no_force_noise() if strategy.uses_suspension else None
     # With the noise of a front axle ahead of a tandem, offsets metres apart would fit alike.
@@ -232,8 +262,8 @@ def _refine_likeliest(
         report(f"freeing the elements, start {len(tried)}", 0.3 + 0.05 * len(tried))
         found, used = fit_all(problem, shifted_to(problem, y, place), strategy)
         evaluations += used
-        if isinstance(found, Optimum) and found.problem.mismatch.level_m3.any():
-            found, used = _refine_offset(found, strategy, max_evaluations - evaluations)
+        if isinstance(found, Optimum) and found.unfinished is None:
+            found, used = _refine_offset(found, strategy, budget.evaluations - evaluations)
             evaluations += used
         if not isinstance(found, Optimum):
             has_friction = found is AbandonReason.CLEAR_FRICTION
@@ -241,11 +271,16 @@ def _refine_likeliest(
         last_chi2 = np.inf if best is None else best.chi2_per_dof
         if best is None or found.chi2_per_dof < best.chi2_per_dof:
             best = found
-        is_last = len(tried) == strategy.max_candidates or evaluations > max_evaluations
+        is_last = len(tried) == strategy.max_candidates or evaluations > budget.evaluations
         if is_last or _is_last_offset(best, found, last_chi2, len(tried)):
             break
     if best is None:
         return _no_optimum(problem, y, evaluations, len(tried), has_friction=has_friction)
+    if best.unfinished is not None and best.chi2_per_dof <= budget.chi2:
+        completed = complete_fit(best)
+        evaluations += completed.evaluations - best.evaluations
+        best, used = _refine_offset(completed, strategy, budget.evaluations - evaluations)
+        evaluations += used
     best, used = _with_free_ends(best, strategy)
     evaluations += used
     return best._replace(
@@ -263,7 +298,8 @@ def _is_last_offset(best: Optimum, found: Optimum, last_chi2: float, tried: int)
     """
     if is_accepted(best.problem, best.chi2_per_dof):
         return True
-    if found.problem.force.any() and not is_better_misfit(found.chi2_per_dof, last_chi2):
+    may_be_last = found.unfinished is not None or found.problem.force.any()
+    if may_be_last and not is_better_misfit(found.chi2_per_dof, last_chi2):
         return True
     return best.chi2_per_dof > _HOPELESS_CHI2[min(tried, len(_HOPELESS_CHI2)) - 1]
 
@@ -307,23 +343,26 @@ def _with_free_ends(found: Optimum, strategy: SearchStrategy) -> tuple[Optimum, 
     """
     where, y = layout(found.problem), found.state.y
     ends = np.intersect1d(where.half_normal, where.bridge)
-    if not np.any(y[ends] > _CLEAR_RESTRAINT) or found.chi2_per_dof > HOPELESS_CHI2:
+    is_restrained = np.any(y[ends] > _CLEAR_RESTRAINT)
+    is_finished = found.unfinished is None
+    if not (is_restrained and is_finished) or found.chi2_per_dof > HOPELESS_CHI2:
         return found, 0
     start = y.copy()
     start[where.bridge] = 0.0
     other, used = fit_all(found.problem, start, strategy)
-    if isinstance(other, Optimum) and other.chi2_per_dof < found.chi2_per_dof:
-        found = other
-    return found, used
+    if not isinstance(other, Optimum):
+        return found, used
+    other = complete_fit(other)
+    return (other if other.chi2_per_dof < found.chi2_per_dof else found), other.evaluations
 
 
 def _refine_offset(
     found: Optimum, strategy: SearchStrategy, max_evaluations: int
 ) -> tuple[Optimum, int]:
-    """Return the best of an optimum with mismatch and its neighbours, and the evaluations."""
+    """Return the best of an optimum and, with mismatch, its neighbours; and the evaluations."""
     evaluations = 0
     for _ in range(_MAX_MOVES):
-        if evaluations > max_evaluations:
+        if evaluations > max_evaluations or not found.problem.mismatch.level_m3.any():
             break
         place, used = better_neighbour(found, strategy)
         evaluations += used
