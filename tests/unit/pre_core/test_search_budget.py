@@ -1,6 +1,6 @@
 """A search ends: the walk along the road has a reach, and the whole has a budget."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -12,6 +12,9 @@ from pre_core.crossing import fit, optimum, walk
 from pre_core.crossing.fit import Optimum
 from pre_core.physics.tandem import NO_LEAD
 from pre_core.search.loop import Termination
+
+BUDGET = optimum._Budget(evaluations=1000, chi2=fit.WORTH_COMPLETING_CHI2)
+STRATEGY = fit.SearchStrategy(0, False, 4, False)
 
 
 def found(chi2: float, evaluations: int, ending: Termination = Termination.CONVERGED) -> Any:
@@ -74,8 +77,8 @@ def test_a_search_that_finds_no_fit_ends_within_its_budget(
 ) -> None:
     budgets: list[int] = []
 
-    def from_places(problem: Any, y: Any, way: Any, report: Any, most: int) -> Any:
-        budgets.append(most)
+    def from_places(problem: Any, y: Any, way: Any, report: Any, left: optimum._Budget) -> Any:
+        budgets.append(left.evaluations)
         return found(5.0, each)
 
     monkeypatch.setattr(optimum, "_refine_candidates", from_places)
@@ -131,11 +134,10 @@ def test_noise_rounds_end_at_a_misfit_that_stays(
 def test_a_hopeless_fit_is_not_repeated_with_free_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     where = SimpleNamespace(half_normal=np.arange(2), bridge=np.arange(2))
     monkeypatch.setattr(optimum, "layout", lambda _: where)
-    monkeypatch.setattr(optimum, "fit_all", lambda *_: (found(1.0, 1), 7))
-    strategy = fit.SearchStrategy(0, False, 4, False)
+    monkeypatch.setattr(optimum, "fit_all", lambda *_: (found(1.0, 7), 7))
     for chi2, used in ((24.0, 7), (26.0, 0)):
         restrained = found(chi2, 1)._replace(state=SimpleNamespace(y=np.ones(2)))
-        better, evaluations = optimum._with_free_ends(restrained, strategy)
+        better, evaluations = optimum._with_free_ends(restrained, STRATEGY)
         assert (better.chi2_per_dof, evaluations) == (1.0 if used else chi2, used)
 
 
@@ -154,11 +156,77 @@ def test_a_hopeless_fit_is_not_repeated_with_free_ends(monkeypatch: pytest.Monke
 def test_offsets_end_where_another_one_fits_no_better(
     chi2: tuple[float, ...], force: float, starts: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    best = refined(iter(found(value, 1) for value in chi2), force, monkeypatch)
+    assert (best.starts, best.chi2_per_dof) == (starts, min(chi2[:starts]))
+
+
+@pytest.mark.parametrize(
+    ("chi2", "starts", "reached", "evaluations"),
+    [
+        ((4.0, 3.9), 2, 1.0, 102),
+        ((4.0, 3.0, 3.0), 3, 1.0, 103),
+        ((6.0, 5.9), 2, 5.9, 2),
+        ((4.0, 1.2), 2, 1.2, 2),
+    ],
+)
+def test_the_best_of_poor_starts_is_completed_after_all_offsets(
+    chi2: tuple[float, ...],
+    starts: int,
+    reached: float,
+    evaluations: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(optimum, "complete_fit", completed)
+    poor = (
+        found(value, 1)._replace(unfinished=STRATEGY if value > 1.7 else None) for value in chi2
+    )
+    best = refined(poor, 0.0, monkeypatch)
+    assert (best.starts, best.chi2_per_dof) == (starts, reached)
+    assert best.evaluations == evaluations
+
+
+@pytest.mark.parametrize(
+    ("reached", "completes_below"), [((), 5.0), ((4.0,), 3.8), ((8.0, 2.0), 1.9), ((9.0,), 5.0)]
+)
+def test_a_poor_start_is_completed_only_if_it_may_fit_better(
+    reached: tuple[float, ...], completes_below: float
+) -> None:
+    poor = found(1.8, 10)._replace(unfinished=STRATEGY)
+    left = optimum._budget_left(1000, [poor, *(found(chi2, 100) for chi2 in reached)])
+    assert left.chi2 == pytest.approx(completes_below)
+    assert left.evaluations == 990 - 100 * len(reached)
+
+
+@pytest.mark.parametrize(("chi2", "ends_at"), [((24.0, 23.0), 1.0), ((26.0, 27.0), 26.0)])
+def test_without_a_fit_the_best_poor_start_is_completed(
+    chi2: tuple[float, float], ends_at: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(optimum, "complete_fit", completed)
+    monkeypatch.setattr(optimum, "is_accepted", lambda _, value: value < 1.5)
+    monkeypatch.setattr(optimum, "strongest_line_at_hz", lambda *_: 0.0)
+    first, second = (found(value, 1)._replace(unfinished=STRATEGY) for value in chi2)
+    monkeypatch.setattr(optimum, "_refine_candidates", lambda *_: first)
+    monkeypatch.setattr(optimum, "_try_other_strategies", lambda *_: [second])
+    problem: Any = SimpleNamespace(crossing=SimpleNamespace(lead=NO_LEAD))
+    ended = optimum._run_strategies(problem, np.zeros(1), lambda *_: None, 1000)
+    assert len(ended) == 2
+    assert min(one.chi2_per_dof for one in ended) == ends_at
+    assert sum(one.evaluations for one in ended) == (102 if ends_at == 1.0 else 2)
+
+
+def completed(one: Optimum) -> Optimum:
+    """Complete a stand-in: it reaches a chi2 of one after a hundred evaluations."""
+    return found(1.0, one.evaluations + 100)._replace(problem=one.problem)
+
+
+def refined(
+    candidates: Iterator[Optimum], force: float, monkeypatch: pytest.MonkeyPatch
+) -> Optimum:
+    """Refine four offsets whose fits are these candidates."""
     problem: Any = SimpleNamespace(
         mismatch=SimpleNamespace(level_m3=np.zeros(1)), force=np.array([force]), front_axle=None
     )
     problem._replace = lambda **_: problem
-    left = iter(chi2)
     places = [walk.Placement(0.0, float(n), np.zeros(1), np.zeros(1, int)) for n in range(4)]
     monkeypatch.setattr(optimum, "_find_truck", lambda *_: (problem, np.zeros(1), 0))
     monkeypatch.setattr(optimum, "noise_power_ratio", lambda *_: 1.0)
@@ -168,11 +236,9 @@ def test_offsets_end_where_another_one_fits_no_better(
     monkeypatch.setattr(optimum, "is_accepted", lambda _, value: value < 1.5)
     monkeypatch.setattr(optimum, "_with_free_ends", lambda best, _: (best, 0))
     monkeypatch.setattr(
-        optimum, "fit_all", lambda *_: (found(next(left), 1)._replace(problem=problem), 1)
+        optimum, "fit_all", lambda *_: (next(candidates)._replace(problem=problem), 1)
     )
-    strategy = fit.SearchStrategy(0, False, 4, False)
-    best = optimum._refine_likeliest(problem, np.zeros(1), strategy, lambda *_: None, 1000)
-    assert (best.starts, best.chi2_per_dof) == (starts, min(chi2[:starts]))
+    return optimum._refine_likeliest(problem, np.zeros(1), STRATEGY, lambda *_: None, BUDGET)
 
 
 class _Problem(NamedTuple):
@@ -205,6 +271,5 @@ def test_offsets_are_scanned_as_if_the_front_axle_were_known(
     monkeypatch.setattr(optimum, "shifted_to", lambda _, y, place: y)
     monkeypatch.setattr(optimum, "fit_all", fit_there)
     monkeypatch.setattr(optimum, "_no_optimum", lambda *_, **__: found(0.0, 1))
-    strategy = fit.SearchStrategy(0, False, 4, False)
-    optimum._refine_likeliest(problem, np.zeros(1), strategy, lambda *_: None, 1000)
+    optimum._refine_likeliest(problem, np.zeros(1), STRATEGY, lambda *_: None, BUDGET)
     assert seen == [None, None, "its spectra"]
