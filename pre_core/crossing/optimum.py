@@ -50,7 +50,7 @@ from pre_core.crossing.preparation import (
 )
 from pre_core.crossing.residuals import SWING_MODES
 from pre_core.crossing.rows import RESIDUALS
-from pre_core.crossing.walk import better_neighbour, scan_offsets, shifted_to
+from pre_core.crossing.walk import Placement, better_neighbour, scan_offsets, shifted_to
 from pre_core.physics.bridge import FloatArray
 from pre_core.search import levenberg_marquardt
 from pre_core.search.loop import Report, Termination
@@ -253,7 +253,45 @@ def _refine_likeliest(
     report("finding the bridge", 0.2)
     places, used = scan_offsets(problem, y, strategy)
     problem, evaluations = problem._replace(front_axle=front_axle), evaluations + used
-    best, has_friction = None, False
+    budget = budget._replace(evaluations=budget.evaluations - evaluations)
+    best, tried, used, has_friction = _fit_candidates(problem, y, places, strategy, report, budget)
+    evaluations += used
+    if best is None:
+        return _no_optimum(problem, y, evaluations, tried, has_friction=has_friction)
+    if best.unfinished is not None and best.chi2_per_dof <= budget.chi2:
+        completed = complete_fit(best)
+        evaluations += completed.evaluations - best.evaluations
+        best, used = _refine_offset(completed, strategy, budget.evaluations - used)
+        evaluations += used
+    best, used = _with_free_ends(best, strategy)
+    return best._replace(
+        evaluations=evaluations + used,
+        starts=tried,
+        stopped_by_friction=has_friction,
+        noise_power=power * _excess_noise_power(best),
+    )
+
+
+class _FittedCandidates(NamedTuple):
+    """Best optimum of those tried, if any; their number, the evaluations, and clear friction."""
+
+    best: Optimum | None
+    tried: int
+    evaluations: int
+    has_friction: bool
+
+
+def _fit_candidates(
+    problem: PosteriorProblem,
+    y: FloatArray,
+    places: list[Placement],
+    strategy: SearchStrategy,
+    report: Report,
+    budget: _Budget,
+) -> _FittedCandidates:
+    """Fit all parameters from the candidate offsets, best first, until no other is worth a try."""
+    best: Optimum | None = None
+    evaluations, has_friction = 0, False
     tried: list[float] = []
     for place in places:
         if any(abs(place.shift_m - other) < _SAME_MINIMUM_M for other in tried):
@@ -262,33 +300,19 @@ def _refine_likeliest(
         report(f"freeing the elements, start {len(tried)}", 0.3 + 0.05 * len(tried))
         found, used = fit_all(problem, shifted_to(problem, y, place), strategy)
         evaluations += used
-        if isinstance(found, Optimum) and found.unfinished is None:
-            found, used = _refine_offset(found, strategy, budget.evaluations - evaluations)
-            evaluations += used
         if not isinstance(found, Optimum):
             has_friction = found is AbandonReason.CLEAR_FRICTION
             break
+        if found.unfinished is None:
+            found, used = _refine_offset(found, strategy, budget.evaluations - evaluations)
+            evaluations += used
         last_chi2 = np.inf if best is None else best.chi2_per_dof
         if best is None or found.chi2_per_dof < best.chi2_per_dof:
             best = found
         is_last = len(tried) == strategy.max_candidates or evaluations > budget.evaluations
         if is_last or _is_last_offset(best, found, last_chi2, len(tried)):
             break
-    if best is None:
-        return _no_optimum(problem, y, evaluations, len(tried), has_friction=has_friction)
-    if best.unfinished is not None and best.chi2_per_dof <= budget.chi2:
-        completed = complete_fit(best)
-        evaluations += completed.evaluations - best.evaluations
-        best, used = _refine_offset(completed, strategy, budget.evaluations - evaluations)
-        evaluations += used
-    best, used = _with_free_ends(best, strategy)
-    evaluations += used
-    return best._replace(
-        evaluations=evaluations,
-        starts=len(tried),
-        stopped_by_friction=has_friction,
-        noise_power=power * _excess_noise_power(best),
-    )
+    return _FittedCandidates(best, len(tried), evaluations, has_friction)
 
 
 def _is_last_offset(best: Optimum, found: Optimum, last_chi2: float, tried: int) -> bool:

@@ -216,7 +216,8 @@ def test_without_a_fit_the_best_poor_start_is_completed(
 
 def completed(one: Optimum) -> Optimum:
     """Complete a stand-in: it reaches a chi2 of one after a hundred evaluations."""
-    return found(1.0, one.evaluations + 100)._replace(problem=one.problem)
+    there: Optimum = found(1.0, one.evaluations + 100)._replace(problem=one.problem)
+    return there
 
 
 def refined(
