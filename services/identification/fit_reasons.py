@@ -12,6 +12,7 @@ from pre_core import parameters
 from pre_core.crossing import posterior, shaking, slip, speeds
 from pre_core.crossing.compliances import MISMATCH_BIAS_SPREAD, mismatch_bias
 from pre_core.crossing.fit import Optimum, normal_approximation
+from pre_core.crossing.misfit import off_bridge_chi2
 from pre_core.crossing.mismatch import pavement_ratio
 from pre_core.crossing.off_bridge import compared_length_m, mismatch_excess, rear_axle_chainage_m
 from pre_core.crossing.rows import RESIDUALS
@@ -30,6 +31,10 @@ from services.identification.checks import (
     undeclared_axles,
 )
 from services.identification.result_parts import Floats
+
+_EXPLAINED_CHI2, _UNEXPLAINED_CHI2 = 1.5, 3.0
+"""Values of chi2 off the bridge, fitted to that alone, up to which the truck and its road are
+explained, and from which they are not."""
 
 
 class ReasonsOfFit(NamedTuple):
@@ -61,11 +66,28 @@ def reasons_of_fit(
     about = {
         **slipped,
         **axles,
+        Reason.MODEL_MISFIT: _place_of_misfit(found) if Reason.MODEL_MISFIT in reasons else "",
         Reason.NOISE_ABOVE_DECLARED: coarse,
         Reason.IMPLAUSIBLE_VEHICLE: odd_parameters(fit),
         Reason.TANDEM_FRICTION: f"about {100.0 * fit.tandem_friction:.2g} % of their load",
     }
     return ReasonsOfFit((*axles, *reasons), about, bool(slipped) or is_misled_by_mismatch(fit))
+
+
+def _place_of_misfit(found: Optimum) -> str:
+    """Return where the model fails, with the likely causes, or "" if that is not clear."""
+    elsewhere = off_bridge_chi2(found)
+    if elsewhere is None or _EXPLAINED_CHI2 < elsewhere < _UNEXPLAINED_CHI2:
+        return ""
+    if elsewhere <= _EXPLAINED_CHI2:
+        return (
+            "only on the bridge; likely causes are another vehicle on it, an undeclared support, a "
+            "wrong span, or a bridge that is no beam"
+        )
+    return (
+        f"also before and behind the bridge (χ² {elsewhere:.2g}); likely causes are another truck "
+        "than declared, a faulty sensor, or different profiles under the axles"
+    )
 
 
 def _fit(data: CrossingData, found: Optimum) -> Fit:
