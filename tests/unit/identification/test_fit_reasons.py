@@ -1,0 +1,26 @@
+"""Where a misfit is: the text of its reason."""
+
+from typing import Any
+
+import pytest
+
+from services.identification import fit_reasons
+
+
+@pytest.mark.parametrize(
+    ("chi2", "text"),
+    [
+        (None, ""),
+        (0.9, "only on the bridge"),
+        (1.5, "only on the bridge"),
+        (2.0, ""),
+        (12.3, "also before and behind the bridge (χ² 12)"),
+    ],
+)
+def test_the_text_of_a_misfit_says_where_it_is(
+    chi2: float | None, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fit_reasons, "off_bridge_chi2", lambda _: chi2)
+    found: Any = None
+    seen = fit_reasons._place_of_misfit(found)
+    assert seen.startswith(text) if text else seen == ""
