@@ -5,7 +5,6 @@ again as the truck changes. `optimum` searches for the right start.
 """
 
 from collections.abc import Callable
-from enum import Enum, auto
 from typing import NamedTuple
 
 import numpy as np
@@ -39,8 +38,9 @@ _FREE_STAGES = ((5.0, 8, 0.2), (1.0, 25, 0.1))
 it."""
 _CLEAR_FRICTION_WEIGHT = 0.05
 """Suspension weight below which full weight is not tried: the friction is clear."""
-_NO_FIT_CHI2 = 10.0
-"""Limit of chi2 at five times the noise: right starts of 90 drawn crossings had 1.6 at most, wrong
+NO_FIT_CHI2 = 10.0
+"""Value of chi2 at five times the noise above which a strategy with full suspension weight ends and
+no fit is completed: right starts of 90 drawn crossings had 1.6 at most, wrong
 ones 10 to 70."""
 _POOR_START_CHI2, WORTH_COMPLETING_CHI2 = 1.7, 5.0
 """Values of chi2 at five times the noise above which a fit is left unfinished until the other
@@ -208,25 +208,17 @@ def is_better_misfit(chi2: float, last: float) -> bool:
     return chi2 <= max(_CLEAR_MISFIT_CHI2, (1.0 - SMALL_GAIN) * last)
 
 
-class AbandonReason(Enum):
-    """Reason why a strategy with full suspension weight has no optimum."""
-
-    CLEAR_FRICTION = auto()
-    NO_FIT = auto()
-
-
 def fit_all(
     problem: PosteriorProblem, y: FloatArray, strategy: SearchStrategy
-) -> tuple[Optimum | AbandonReason, int]:
-    """Fit all parameters from y (size,); return the optimum or why there is none, and evaluations.
+) -> tuple[Optimum | None, int]:
+    """Fit all parameters from y (size,); return the optimum, if there is one, and evaluations.
 
     Negative stiffness and damping coordinates are fixed at zero, and the others brought to the
     neighbouring optimum. The remaining gradient belongs to the `normal_approximation`.
 
     Suspension residuals and suspension weight depend on each other: with low weight the truck need
     not fit. So the first fit has full weight, reduced only where the body equations then leave more
-    than sensor noise. A strategy with full weight ends without optimum at clear friction or
-    divergence.
+    than sensor noise. A strategy with full weight ends without optimum at clear friction.
     """
     front = points(problem, y[None, :]).position_m[0]
     crossing = problem.crossing
@@ -245,9 +237,7 @@ def fit_all(
     problem = update_noise(at_full_weight, y)
     has_friction = problem.force.any() and suspension_weight(problem, y) < _CLEAR_FRICTION_WEIGHT
     if strategy.uses_suspension and has_friction:
-        return AbandonReason.CLEAR_FRICTION, evaluations
-    if strategy.uses_suspension and chi2_per_dof(at_full_weight, y) > _NO_FIT_CHI2:
-        return AbandonReason.NO_FIT, evaluations
+        return None, evaluations
     is_reduced = has_friction or (problem.force.any() and not strategy.uses_suspension)
     problem = at_full_weight
     if is_reduced:

@@ -19,9 +19,9 @@ import numpy as np
 from pre_core.crossing.fit import (
     FAR_OFF_CHI2,
     HOPELESS_CHI2,
+    NO_FIT_CHI2,
     SMALL_GAIN,
     WORTH_COMPLETING_CHI2,
-    AbandonReason,
     Optimum,
     SearchStrategy,
     complete_fit,
@@ -31,6 +31,7 @@ from pre_core.crossing.fit import (
     is_better_misfit,
     resting_mode_indices,
 )
+from pre_core.crossing.misfit import fit_off_bridge, is_explained_off_bridge
 from pre_core.crossing.noise import no_force_noise
 from pre_core.crossing.off_bridge import levels_at, off_bridge_residuals
 from pre_core.crossing.posterior import (
@@ -90,8 +91,7 @@ _WITHOUT_MISMATCH = (
 _WITH_MISMATCH = (SearchStrategy(SWING_MODES, True, 1, True), SearchStrategy(0, False, 4, True))
 """The simplest strategy first, then others until one ends at a fit, because each superfluous
 freedom may mislead. Of 40 drawn crossings and 36 with unexpected bearings, spans or tyres the first
-found all but one, which the second did. Strategies with mismatch precede the others where the
-residuals off the bridge show it."""
+found all but one, which the second did."""
 
 
 class _Budget(NamedTuple):
@@ -153,9 +153,11 @@ def _run_strategies(
     budget = _Budget(max_evaluations, WORTH_COMPLETING_CHI2)
     found = [_refine_candidates(problem, y, simplest, report, budget)]
     if not _has_ended(found[0]):
-        found += _try_other_strategies(problem, y, found[0], report, max_evaluations)
+        strategies, used = _other_strategies(found[0])
+        found[0] = found[0]._replace(evaluations=found[0].evaluations + used)
+        found += _try_strategies(problem, y, strategies, found[0], report, max_evaluations)
     best = min(range(len(found)), key=lambda k: found[k].chi2_per_dof)
-    if found[best].chi2_per_dof <= HOPELESS_CHI2 and not _has_ended(found[-1]):
+    if found[best].chi2_per_dof <= NO_FIT_CHI2 and not _has_ended(found[-1]):
         found.append(complete_fit(found.pop(best)))
     return found
 
@@ -167,19 +169,31 @@ def _has_ended(found: Optimum) -> bool:
     return strongest_line_at_hz(found.problem, found.state.y) > 0.0
 
 
-def _try_other_strategies(
-    problem: PosteriorProblem, y: FloatArray, first: Optimum, report: Report, max_evaluations: int
-) -> list[Optimum]:
-    """Return the optima of the other strategies, up to the first that is final."""
-    differs = first.differs
-    if first.ending is not Termination.NOT_FINITE:
-        differs = bool(levels_at(first.problem, first.state.y).any())
+def _other_strategies(first: Optimum) -> tuple[tuple[SearchStrategy, ...], int]:
+    """Return the strategies to try after the simplest has not ended at a fit, and evaluations.
+
+    Where a linear truck on one profile explains the residuals off the bridge, no other truck is
+    tried. A suspension that is not linear resembles mismatch until its weight is reduced.
+    """
     full_weight, reduced_weight = _WITHOUT_MISMATCH
-    strategies = (*_WITHOUT_MISMATCH, *_WITH_MISMATCH)
-    if differs:
-        # A suspension that is not linear resembles mismatch until its weight is reduced, which a
-        # first stage shows.
-        strategies = (reduced_weight, *_WITH_MISMATCH, full_weight)
+    strategies: tuple[SearchStrategy, ...] = (reduced_weight, *_WITH_MISMATCH, full_weight)
+    if first.differs or first.stopped_by_friction or first.problem.mismatch.level_m3.any():
+        return strategies, 0
+    alone = fit_off_bridge(first)
+    if is_explained_off_bridge(first.problem, alone):
+        strategies = (full_weight,)
+    return strategies, alone.evaluations
+
+
+def _try_strategies(
+    problem: PosteriorProblem,
+    y: FloatArray,
+    strategies: tuple[SearchStrategy, ...],
+    first: Optimum,
+    report: Report,
+    max_evaluations: int,
+) -> list[Optimum]:
+    """Return the optima of the strategies after the first one, up to the first that is final."""
     found: list[Optimum] = []
     has_friction = first.stopped_by_friction
     for strategy in strategies:
@@ -300,8 +314,8 @@ def _fit_candidates(
         report(f"freeing the elements, start {len(tried)}", 0.3 + 0.05 * len(tried))
         found, used = fit_all(problem, shifted_to(problem, y, place), strategy)
         evaluations += used
-        if not isinstance(found, Optimum):
-            has_friction = found is AbandonReason.CLEAR_FRICTION
+        if found is None:
+            has_friction = True
             break
         if found.unfinished is None:
             found, used = _refine_offset(found, strategy, budget.evaluations - evaluations)
@@ -322,7 +336,10 @@ def _is_last_offset(best: Optimum, found: Optimum, last_chi2: float, tried: int)
     """
     if is_accepted(best.problem, best.chi2_per_dof):
         return True
-    may_be_last = found.unfinished is not None or found.problem.force.any()
+    strategy = found.unfinished
+    if strategy is not None and strategy.uses_suspension and found.chi2_per_dof > NO_FIT_CHI2:
+        return True
+    may_be_last = strategy is not None or found.problem.force.any()
     if may_be_last and not is_better_misfit(found.chi2_per_dof, last_chi2):
         return True
     return best.chi2_per_dof > _HOPELESS_CHI2[min(tried, len(_HOPELESS_CHI2)) - 1]
@@ -374,7 +391,7 @@ def _with_free_ends(found: Optimum, strategy: SearchStrategy) -> tuple[Optimum, 
     start = y.copy()
     start[where.bridge] = 0.0
     other, used = fit_all(found.problem, start, strategy)
-    if not isinstance(other, Optimum):
+    if other is None:
         return found, used
     other = complete_fit(other)
     return (other if other.chi2_per_dof < found.chi2_per_dof else found), other.evaluations
@@ -396,7 +413,7 @@ def _refine_offset(
             found.problem, shifted_to(found.problem, found.state.y, place), strategy
         )
         evaluations += used
-        if not isinstance(other, Optimum) or other.chi2_per_dof >= found.chi2_per_dof:
+        if other is None or other.chi2_per_dof >= found.chi2_per_dof:
             break
         found = other
     return found, evaluations

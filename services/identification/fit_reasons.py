@@ -12,7 +12,7 @@ from pre_core import parameters
 from pre_core.crossing import posterior, shaking, slip, speeds
 from pre_core.crossing.compliances import MISMATCH_BIAS_SPREAD, mismatch_bias
 from pre_core.crossing.fit import Optimum, normal_approximation
-from pre_core.crossing.misfit import off_bridge_chi2
+from pre_core.crossing.misfit import EXPLAINED_CHI2, fit_off_bridge
 from pre_core.crossing.mismatch import pavement_ratio
 from pre_core.crossing.off_bridge import compared_length_m, mismatch_excess, rear_axle_chainage_m
 from pre_core.crossing.rows import RESIDUALS
@@ -32,9 +32,8 @@ from services.identification.checks import (
 )
 from services.identification.result_parts import Floats
 
-_EXPLAINED_CHI2, _UNEXPLAINED_CHI2 = 1.5, 3.0
-"""Values of chi2 off the bridge, fitted to that alone, up to which the truck and its road are
-explained, and from which they are not."""
+_UNEXPLAINED_CHI2 = 3.0
+"""Value of chi2 off the bridge, fitted to that alone, from which the truck is not explained."""
 
 
 class ReasonsOfFit(NamedTuple):
@@ -76,10 +75,10 @@ def reasons_of_fit(
 
 def _place_of_misfit(found: Optimum) -> str:
     """Return where the model fails, with the likely causes, or "" if that is not clear."""
-    elsewhere = off_bridge_chi2(found)
-    if elsewhere is None or _EXPLAINED_CHI2 < elsewhere < _UNEXPLAINED_CHI2:
+    elsewhere = fit_off_bridge(found).chi2
+    if EXPLAINED_CHI2 < elsewhere < _UNEXPLAINED_CHI2 or not np.isfinite(elsewhere):
         return ""
-    if elsewhere <= _EXPLAINED_CHI2:
+    if elsewhere <= EXPLAINED_CHI2:
         return (
             "only on the bridge; likely causes are another vehicle on it, an undeclared support, a "
             "wrong span, or a bridge that is no beam"

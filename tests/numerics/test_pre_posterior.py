@@ -11,7 +11,7 @@ from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing import channels
 from pre_core.crossing.channels import channel_signals
 from pre_core.crossing.fit import Optimum, chi2_per_dof
-from pre_core.crossing.misfit import off_bridge_chi2
+from pre_core.crossing.misfit import fit_off_bridge
 from pre_core.crossing.posterior import (
     ChainageFixes,
     PosteriorProblem,
@@ -456,14 +456,14 @@ def test_a_wrong_bridge_is_no_misfit_off_it(here: Case) -> None:
     y[layout(problem).elements] += 1.0
     found = optimum_at(problem, y)
     assert found.chi2_per_dof > 10.0
-    assert off_bridge_chi2(found) == pytest.approx(1.0, abs=0.2)
+    assert fit_off_bridge(found).chi2 == pytest.approx(1.0, abs=0.2)
 
 
 def test_noise_of_three_times_the_declared_is_a_misfit_off_the_bridge(here: Case) -> None:
     noise = here.problem.noise
     quieter = noise._replace(factor=noise.factor / 3.0, reciprocal=3.0 * noise.reciprocal)
     found = optimum_at(here.problem._replace(noise=quieter), here.y)
-    assert off_bridge_chi2(found) == pytest.approx(9.0, rel=0.2)
+    assert fit_off_bridge(found).chi2 == pytest.approx(9.0, rel=0.2)
 
 
 def optimum_at(problem: PosteriorProblem, y: FloatArray) -> Optimum:

@@ -261,9 +261,9 @@ def test_offsets_are_scanned_as_if_the_front_axle_were_known(
         seen.append(problem.front_axle)
         return [walk.Placement(0.0, 0.0, np.zeros(1), np.zeros(1, int))], 0
 
-    def fit_there(problem: Any, *_: Any) -> tuple[Any, int]:
+    def fit_there(problem: Any, *_: Any) -> tuple[None, int]:
         seen.append(problem.front_axle)
-        return fit.AbandonReason.CLEAR_FRICTION, 0
+        return None, 0
 
     monkeypatch.setattr(optimum, "_find_truck", find_truck)
     monkeypatch.setattr(optimum, "noise_power_ratio", lambda *_: 1.0)
