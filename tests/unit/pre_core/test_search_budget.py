@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pre_core.crossing import fit, optimum, walk
+from pre_core.crossing import fit, misfit, optimum, walk
 from pre_core.crossing.fit import Optimum
+from pre_core.crossing.misfit import OffBridgeFit
 from pre_core.physics.tandem import NO_LEAD
 from pre_core.search.loop import Termination
 
@@ -19,8 +20,12 @@ STRATEGY = fit.SearchStrategy(0, False, 4, False)
 
 def found(chi2: float, evaluations: int, ending: Termination = Termination.CONVERGED) -> Any:
     """A stand-in for an optimum, as the choice among them sees it."""
-    on_two_axles = SimpleNamespace(lead=NO_LEAD)
-    unknown: Any = SimpleNamespace(y=np.zeros(1), lines_hz=(), crossing=on_two_axles)
+    unknown: Any = SimpleNamespace(
+        y=np.zeros(1),
+        lines_hz=(),
+        crossing=SimpleNamespace(lead=NO_LEAD),
+        mismatch=SimpleNamespace(level_m3=np.zeros(1)),
+    )
     return Optimum(unknown, unknown, ending, chi2, evaluations, 1)
 
 
@@ -83,13 +88,14 @@ def test_a_search_that_finds_no_fit_ends_within_its_budget(
 
     monkeypatch.setattr(optimum, "_refine_candidates", from_places)
     monkeypatch.setattr(optimum, "build_problem", lambda inputs: (found(0.0, 0).problem, None))
-    monkeypatch.setattr(optimum, "levels_at", lambda problem, y: np.zeros(1))
+    off_bridge = OffBridgeFit(np.zeros(1), 30.0, 10)
+    monkeypatch.setattr(optimum, "fit_off_bridge", lambda one: off_bridge)
     monkeypatch.setattr(optimum, "strongest_line_at_hz", lambda problem, y: 0.0)
     monkeypatch.setattr(optimum, "is_accepted", lambda problem, chi2: chi2 < 1.5)
     inputs: Any = None
     best = optimum.find_optimum(inputs)
     assert min(budgets) > 0
-    assert best.evaluations == each * len(budgets)
+    assert best.evaluations == each * len(budgets) + off_bridge.evaluations
     assert best.evaluations < optimum._MAX_EVALUATIONS + each
     assert best.ending is Termination.STEPS_EXHAUSTED
 
@@ -197,7 +203,36 @@ def test_a_poor_start_is_completed_only_if_it_may_fit_better(
     assert left.evaluations == 990 - 100 * len(reached)
 
 
-@pytest.mark.parametrize(("chi2", "ends_at"), [((24.0, 23.0), 1.0), ((26.0, 27.0), 26.0)])
+@pytest.mark.parametrize(
+    ("off_bridge", "level", "tried"),
+    [(1.4, 0.0, "full weight"), (1.6, 0.0, "all"), (1.4, 1.0, "all"), (30.0, 1.0, "all")],
+)
+def test_other_trucks_are_tried_only_where_the_first_fails_off_the_bridge(
+    off_bridge: float, level: float, tried: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = OffBridgeFit(np.zeros(1), off_bridge, 10)
+    monkeypatch.setattr(optimum, "fit_off_bridge", lambda one: alone)
+    monkeypatch.setattr(misfit, "levels_at", lambda problem, y: np.array([level]))
+    strategies, used = optimum._other_strategies(found(5.0, 1))
+    assert used == 10
+    full_weight, reduced_weight = optimum._WITHOUT_MISMATCH
+    everything = (reduced_weight, *optimum._WITH_MISMATCH, full_weight)
+    assert strategies == ((full_weight,) if tried == "full weight" else everything)
+
+
+@pytest.mark.parametrize("clear", ["differs", "stopped_by_friction"])
+def test_clear_friction_and_mismatch_need_no_fit_off_the_bridge(
+    clear: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_fit(one: Optimum) -> OffBridgeFit:
+        raise AssertionError("the residuals off the bridge were fitted")
+
+    monkeypatch.setattr(optimum, "fit_off_bridge", no_fit)
+    strategies, used = optimum._other_strategies(found(5.0, 1)._replace(**{clear: True}))
+    assert (len(strategies), used) == (4, 0)
+
+
+@pytest.mark.parametrize(("chi2", "ends_at"), [((9.0, 8.0), 1.0), ((11.0, 12.0), 11.0)])
 def test_without_a_fit_the_best_poor_start_is_completed(
     chi2: tuple[float, float], ends_at: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,7 +241,8 @@ def test_without_a_fit_the_best_poor_start_is_completed(
     monkeypatch.setattr(optimum, "strongest_line_at_hz", lambda *_: 0.0)
     first, second = (found(value, 1)._replace(unfinished=STRATEGY) for value in chi2)
     monkeypatch.setattr(optimum, "_refine_candidates", lambda *_: first)
-    monkeypatch.setattr(optimum, "_try_other_strategies", lambda *_: [second])
+    monkeypatch.setattr(optimum, "_other_strategies", lambda _: ((), 0))
+    monkeypatch.setattr(optimum, "_try_strategies", lambda *_: [second])
     problem: Any = SimpleNamespace(crossing=SimpleNamespace(lead=NO_LEAD))
     ended = optimum._run_strategies(problem, np.zeros(1), lambda *_: None, 1000)
     assert len(ended) == 2
