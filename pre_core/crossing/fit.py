@@ -40,8 +40,7 @@ _CLEAR_FRICTION_WEIGHT = 0.05
 """Suspension weight below which full weight is not tried: the friction is clear."""
 NO_FIT_CHI2 = 10.0
 """Value of chi2 at five times the noise above which a strategy with full suspension weight ends and
-no fit is completed: right starts of 90 drawn crossings had 1.6 at most, wrong
-ones 10 to 70."""
+no fit is completed: right starts of 90 drawn crossings had 1.6 at most, wrong ones 10 to 70."""
 _POOR_START_CHI2, WORTH_COMPLETING_CHI2 = 1.7, 5.0
 """Values of chi2 at five times the noise above which a fit is left unfinished until the other
 offsets were tried, and is not completed before other strategies either. Accepted fits had 1.7 at

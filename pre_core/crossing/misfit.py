@@ -25,7 +25,7 @@ class OffBridgeFit(NamedTuple):
 
     y: FloatArray
     chi2: float
-    """Mean square of these residuals, infinite without any."""
+    """Mean square of these residuals per degree of freedom, infinite without any."""
     evaluations: int
 
 
@@ -46,8 +46,9 @@ def fit_off_bridge(found: Optimum) -> OffBridgeFit:
         return np.concatenate([values[:, data], values[:, count:]], axis=1)
 
     there = minimise(rows, np.zeros(free.shape[1]), _STEPS, _GAIN, is_followed=True)
-    white = there.state.residual[: data.size : chi2_stride(problem)]
-    chi2 = float(white @ white) / white.size
+    stride = chi2_stride(problem)
+    white = there.state.residual[: data.size : stride]
+    chi2 = float(white @ white) / max(1.0, white.size - free.shape[1] / stride)
     return OffBridgeFit(y + free @ there.state.y, chi2, evaluations_of(there))
 
 
