@@ -76,9 +76,11 @@ USER driveby
 FROM common AS service
 COPY --from=service-environment /opt/driveby /opt/driveby
 # Python writes compiled what is imported here, and nothing when it runs: its files are read-only.
+# What numba wrote as root is removed: the service writes there itself.
 RUN python -c "import driveby.services.logger.run, driveby.services.cli.metrics" \
     && python -c "import driveby.services.worker.run, driveby.services.simulation.drive" \
-    && driveby health --help >/dev/null
+    && driveby health --help >/dev/null \
+    && rm -rf /tmp/kernels
 # The root file system is read-only and numba wants to write beside what it reads, so entrypoint.sh
 # copies these 8 MB to memory.
 RUN NUMBA_CACHE_DIR=/app/kernels /app/entrypoint.sh python -m driveby.services.execution.warm_up --strict
@@ -87,5 +89,5 @@ USER driveby
 FROM service AS view
 USER root
 COPY --from=view-environment /new /
-RUN python -c "import driveby.services.viewer.rerun_file"
+RUN python -c "import driveby.services.viewer.rerun_file" && rm -rf /tmp/kernels
 USER driveby

@@ -43,11 +43,10 @@ from services.common.files import read_bytes
 
 _log = logging.getLogger(__name__)
 _ENDPOINT = re.compile(r"(tcp|tls|quic|ws|unixsock-stream)/\S+")
-_CONNECT_MS = 10_000
-"""Limit of an attempt: a handshake takes four round trips, more where packets are lost."""
-_ONCE = "retry_period_init_ms=0"
-"""Setting of an endpoint that is tried once: a refused attempt ends at once, so that Python can
-handle a signal before the next one. Zenoh would repeat it until the limit."""
+_TRY_ONCE_MS = 0
+"""Setting of a client whose attempt is not repeated by Zenoh: a refused one ends at once, so that
+Python can handle a signal before the next one. One that is neither refused nor answered ends after
+Zenoh's limit for a handshake, 10 s: it takes four round trips, more where packets are lost."""
 _PAUSE_S = 0.1
 """Pause between attempts that are refused at once."""
 _CONNECT_S = 1.0
@@ -149,9 +148,9 @@ def _configuration(endpoint: str, tls: Path | None, *, is_client: bool) -> zenoh
     config = zenoh.Config()
     settings: dict[str, Any] = {
         "mode": "client" if is_client else "router",
-        "connect/endpoints": [_once(endpoint)] if is_client else [],
+        "connect/endpoints": [endpoint] if is_client else [],
         "listen/endpoints": [] if is_client else [endpoint],
-        "connect/timeout_ms": _CONNECT_MS,
+        "connect/timeout_ms": _TRY_ONCE_MS,
         "connect/retry": {
             "period_init_ms": 100,
             "period_max_ms": 500,
@@ -171,10 +170,6 @@ def _configuration(endpoint: str, tls: Path | None, *, is_client: bool) -> zenoh
     if tls is not None:
         _add_security(config, tls.absolute(), is_client=is_client)
     return config
-
-
-def _once(endpoint: str) -> str:
-    return f"{endpoint}{';' if '#' in endpoint else '#'}{_ONCE}"
 
 
 def _add_security(config: zenoh.Config, tls: Path, *, is_client: bool) -> None:

@@ -1,5 +1,6 @@
 """The bus over real sessions in this process: identity, latching, fetching again, delivery."""
 
+import socket
 import sys
 import threading
 import time
@@ -245,6 +246,27 @@ def test_client_connects_over_a_slow_link(router: zenoh.Session, endpoint: str) 
             assert found.payload == b"1"
         publisher.close()
         client.close()
+
+
+def test_a_client_pauses_between_attempts_to_reconnect() -> None:
+    server = socket.create_server(("127.0.0.1", 0))
+    endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
+    server.close()
+    router = open_session(listen=endpoint)
+    client = open_session(connect=endpoint, timeout_s=LONGEST_S)
+    router.close()
+    attempts: list[float] = []
+    with socket.create_server(("127.0.0.1", server_port(endpoint))) as refusing:
+        refusing.settimeout(LONGEST_S)
+        while len(attempts) < 5:
+            refusing.accept()[0].close()
+            attempts.append(time.monotonic())
+    client.close()
+    assert attempts[-1] - attempts[0] > 0.2
+
+
+def server_port(endpoint: str) -> int:
+    return int(endpoint.rpartition(":")[2])
 
 
 def test_the_address_is_taken(router: zenoh.Session, endpoint: str) -> None:
