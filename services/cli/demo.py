@@ -395,7 +395,7 @@ def _print(console: "Console", crossing: CrossingResult, drive: SimulatedDrive, 
     if misses:
         share = 100.0 * (1.0 - _INTERVAL ** len(nominal))
         console.print(
-            f"Of {len(nominal)} intervals of 95 % at least one misses the truth "
+            f"Of {len(nominal)} intervals (95 %) at least one misses the truth "
             f"in {share:.0f} % of crossings.",
             highlight=False,
         )

@@ -16,7 +16,7 @@ from services.common.options import (
     tls_option,
 )
 
-_PATTERNS = "patterns with * and ?, commas between, of STREAM or OWNER/ID/STREAM"
+_PATTERNS = "patterns with * and ?, separated by commas, of STREAM or OWNER/ID/STREAM"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class ReplaySettings:
     """Options of `driveby replay`: a drive, its published part, and the pace."""
 
     recordings: tuple[Path, ...] = positional(
-        "recordings, or folders of them: one drive, in the order of time",
+        "recordings, or folders of them: one drive, replayed in time order",
         Path,
         nargs="+",
         metavar="REC.mcap|DIR",
@@ -57,7 +57,7 @@ class ReplaySettings:
     )
     paused: bool = flag("begin paused; needs a terminal", group="when")
     topics: tuple[str, ...] = opt(
-        f"only these: {_PATTERNS} (accel,gnss or vehicle/*/accel)",
+        f"topics to publish: {_PATTERNS} (accel,gnss or vehicle/*/accel)",
         names,
         group="what",
         default=(),

@@ -12,7 +12,7 @@ class CertsSettings:
     """Credentials to make in a folder, to renew and to revoke."""
 
     folder: Path = positional(
-        "folder of credentials; the first run makes an authority, router, logger, worker, "
+        "folder of credentials; the first run makes those of authority, router, logger, worker, "
         "viewer and replay",
         Path,
         metavar="FOLDER",

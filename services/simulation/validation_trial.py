@@ -422,7 +422,7 @@ def _against(
     missed = figures.intervals - figures.covered
     if missed > (1.0 - LEAST_COVERAGE) * (figures.intervals + to_come):
         return (
-            f"{missed} of {figures.intervals} intervals of 95 % miss the truth, at most "
+            f"{missed} of {figures.intervals} intervals (95 %) miss the truth, at most "
             f"{100 * (1.0 - LEAST_COVERAGE):.0f} % may"
         )
     squares = figures.intervals * (figures.rms_z or 0.0) ** 2
@@ -443,8 +443,8 @@ def _why_not(tried: Sequence[ValidationCrossing]) -> str:
 
 
 def _for(figures: ValidationFigures) -> str:
-    weak = f", a weak element stands out in {figures.weak_found} of {figures.weak}"
+    weak = f", a weak element is detected in {figures.weak_found} of {figures.weak}"
     return (
         f"{figures.good} of {figures.crossings} crossings are good, {figures.covered} of "
-        f"{figures.intervals} intervals of 95 % hold the truth{weak if figures.weak else ''}"
+        f"{figures.intervals} intervals (95 %) contain the truth{weak if figures.weak else ''}"
     )

@@ -38,7 +38,7 @@ class WorkerSettings:
     file: Path | None = output_option("single new file for the results (and .json)", "RESULTS.mcap")
     method: str = method_option()
     processes: int = opt(
-        "number of crossings identified at once, in addition to the listening process (default: 1)",
+        "number of processes that identify crossings, one at a time each (default: 1)",
         whole("processes", 1, 256),
         default=1,
         metavar="N",

@@ -37,7 +37,10 @@ _HOW = (
 class AlarmOptions:
     """Options of `driveby alarm`: the action, and how changes are detected."""
 
-    what: str = positional("check | list | ack BRIDGE | serve", choices=_WHAT)
+    what: str = positional(
+        "detect changes, list alarms, acknowledge one (ack BRIDGE), or check and publish regularly",
+        choices=_WHAT,
+    )
     bridge: str | None = positional("bridge whose alarm is acknowledged", nargs="?")
     history: Path = history_option()
     realm: str | None = opt("realm of the bridge, where it is in several")

@@ -25,7 +25,7 @@ class CatalogOptions:
 
     folder: str = positional("folder with recordings below", metavar="DIR|s3://…")
     verify: bool = flag(
-        "read every recording and compare it with its row, even where size and time agree"
+        "read every recording and compare it with its catalogue row, even where size and time agree"
     )
     site: Path | None = site_option("list crossings of its bridges, from positions alone")
     csv: Path | None = output_option(

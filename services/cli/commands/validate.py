@@ -96,9 +96,9 @@ class ValidateOptions:
     steps: int = opt("number of steps (default: 600)", whole("steps", 1), default=600)
     seed: int = seed_option()
     method: str | None = opt(
-        "paper: its search and least squares, without sensors; pre: coverage of its intervals "
-        "(exit code 1 if an aim is missed; the options below) (default: paper, and with --site "
-        "neither, but site validation)",
+        "paper: the paper's search and least squares, without sensors; pre: coverage of its "
+        "intervals (exit code 1 if a criterion is not met; the options below) (default: paper, and "
+        "with --site neither, but site validation)",
         choices=("paper", "pre"),
     )
     truck: str | None = opt(
@@ -116,7 +116,7 @@ class ValidateOptions:
         default=200,
     )
     control: int = opt(
-        "number of them repeated with half the noise declared (default: 20)",
+        "number of crossings repeated with half the noise declared (default: 20)",
         whole("a number of crossings", 0),
         default=20,
     )

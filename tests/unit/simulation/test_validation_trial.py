@@ -113,7 +113,7 @@ def test_intervals_that_miss_too_often_fail() -> None:
     some = [made_up(k, 2.1, 0.0, 0.0, 0.0, 0.0) for k in range(CROSSINGS)]
     passed, reason = outcome(*some)
     assert not passed
-    assert "intervals of 95 % miss the truth, at most 15 % may" in reason
+    assert "intervals (95 %) miss the truth, at most 15 % may" in reason
     # 10 of 60 are more than 15 %, whatever comes after.
     assert judge_trial(some[:9]) is None
     assert judge_trial(some[:10]) is not None
