@@ -310,7 +310,7 @@ def _support_lines(derived: Derived, *, torsion_declared: bool) -> Iterator[str]
         likely = f"{100.0 * derived.probability_torsion:.0f} %"
         yield f"probability that the deck twists under the truck: {likely}"
     if derived.springs_believed is not None:
-        yield f"suspension weight: {100.0 * derived.springs_believed:.0f} %"
+        yield f"weight of the suspension equations: {100.0 * derived.springs_believed:.0f} %"
 
 
 def _level_lines(crossing: CrossingResult) -> Iterator[str]:

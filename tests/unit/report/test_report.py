@@ -96,7 +96,7 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     assert "A loss that affects all elements equally cannot be detected without a baseline." in text
     # The evidence.
     assert "misfit (χ² per degree of freedom) 1.02 1.02 of the residuals" in text
-    assert "suspension weight (%) 100 100 100 %" in text
+    assert "weight of the suspension equations (%) 100 100 100 %" in text
     assert "rotational restraint (%) 3 and 4 3 and 4 probability" in text
     assert "R-hat 1 1 agreement" in text
     assert "truck-1 south-west to north-east 10.0 pre good yes" in text
@@ -127,7 +127,7 @@ def test_a_baseline_shows_what_all_elements_share(site: Site, tmp_path: Path) ->
         "element 7 (25.7 to 30.0 m from the south-west end, 0.0 to 4.3 m from the north-east end)"
     )
     assert last in text
-    assert ", and at the bearing there inspected." in text
+    assert " and the bearing there inspected." in text
     assert "Keep these results" not in text
     assert "built differently" not in text
     assert "No baseline is stored" not in text
@@ -149,7 +149,7 @@ def test_before_and_after_stand_beside_each_other_with_the_change(
     now = results_of(site, some_crossing("z", entry=9e6), used="z", ratios=ratios)
     found = reported(site, now, baseline=then)
     assert (
-        "Compared with the baseline then.json: 3 crossings on 2026-09-21, with truck-1; this "
+        "Compared with the baseline then.json: 3 crossings on 2026-09-21, with truck-1; that "
         "measurement is good" in found.text
     )
     assert "Element From–to (m) Before (GN·m²) After (GN·m²) Change (95 % interval)" in found.text
@@ -515,7 +515,7 @@ def test_on_paper_the_first_page_of_an_end_that_is_weak_is_one_sheet(
     found = fused(site, KNOWN, **state)
     reports = bridge_reports([(Path("drive.json"), found, site)], None)
     html.write_text(page(reports))
-    assert "at the bearing there" in html.read_text()
+    assert "the bearing there" in html.read_text()
     pdf.write_pdf(html, tmp_path / "r.pdf", browser)
     assert number_of_sheets(tmp_path / "r.pdf") == 2
 
@@ -581,7 +581,7 @@ def test_a_measurement_that_could_have_missed_a_loss_does_not_reassure(
     assert ("class", "finding sound") not in found.attributes
     assert headline in found.text
     (seen,) = re.findall(
-        r"would have been seen from (\d+) % in element \d, only from (\d+) % in element \d",
+        r"would have been detected is (\d+) % in element \d and (\d+) % in element \d",
         found.text,
     )
     assert 10 < int(seen[0]) <= int(seen[1])
