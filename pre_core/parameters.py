@@ -30,7 +30,8 @@ class ParameterSpec(NamedTuple):
     """Index in a pair (front, rear) or (start, end)."""
     mass_power: int = 0
     """Power of the total mass to which the parameter is proportional for given accelerations: a
-    truck twice as heavy has springs twice as stiff, and so has the bridge that it deflects equally.
+    truck twice as heavy has springs twice as stiff, and a bridge that deflects equally is twice as
+    stiff.
     """
     may_be_zero: bool = False
     """Whether it is estimated with a half-normal prior at zero if its nominal value is zero; any

@@ -20,7 +20,7 @@ from pre_core.crossing.posterior import (
     points,
     posterior_covariance,
     precision_root,
-    suspension_weight,
+    suspension_equation_weight,
 )
 from pre_core.crossing.preparation import (
     swing_sample,
@@ -37,18 +37,19 @@ _FREE_STAGES = ((5.0, 8, 0.2), (1.0, 25, 0.1))
 """Temperatures (factors of the noise), steps at each, and the gain in the sum of squares that ends
 it."""
 _CLEAR_FRICTION_WEIGHT = 0.05
-"""Suspension weight below which full weight is not tried: the friction is clear."""
+"""Weight of the suspension equations below which full weight is not tried: friction is clear."""
 NO_FIT_CHI2 = 10.0
-"""Value of chi2 at five times the noise above which a strategy with full suspension weight ends and
-no fit is completed: right starts of 90 drawn crossings had 1.6 at most, wrong ones 10 to 70."""
+"""Value of chi2 at five times the noise above which a strategy with full weight of the suspension
+equations ends and no fit is completed: right starts of 90 simulated crossings had 1.6 at most,
+wrong ones 10 to 70."""
 _POOR_START_CHI2, WORTH_COMPLETING_CHI2 = 1.7, 5.0
 """Values of chi2 at five times the noise above which a fit is left unfinished until the other
 offsets were tried, and is not completed before other strategies either. Accepted fits had 1.7 at
-most, and one of 50 had 3.7; sound crossings with mismatch had 2 to 20 without it."""
+most, and one of 50 had 3.7; fault-free crossings with mismatch had 2 to 20 without it."""
 FAR_OFF_CHI2 = 200.0
-"""Value of chi2 at five times the noise, with reduced suspension weight, above which the fit is not
-continued, and of a first fit, above which no other offset is tried: sound crossings had 13 at most
-from an offset, one with a second vehicle up to 1,900."""
+"""Value of chi2 at five times the noise, with reduced weight of the suspension equations, above
+which the fit is not continued, and of a first fit, above which no other offset is tried: fault-free
+crossings had 13 at most from an offset, one with a second vehicle up to 1,900."""
 HOPELESS_CHI2 = 25.0
 """Value of chi2 after a fit above which it is not repeated with another noise or free ends, nor, at
 a second offset, from a third one."""
@@ -62,12 +63,12 @@ determined parameters."""
 _SAME_LEVEL = 0.1
 """Relative change of a noise level that counts as converged."""
 _CLEAR_MISFIT = 5.0
-"""Mean square of residuals and priors, with reduced suspension weight, above which a minimum need
-not be exact."""
+"""Mean square of residuals and priors, with reduced weight of the suspension equations, above which
+a minimum need not be exact."""
 SMALL_GAIN, _CLEAR_MISFIT_CHI2 = 0.05, 2.0
 """Relative reduction of chi2 below which no other noise or offset is tried at a clear misfit, and
-the chi2 of such a misfit. Of 16 sound crossings with mismatch, fits without it from four offsets
-had 1.9 to 12, within 12 % of each other."""
+the chi2 of such a misfit. Of 16 fault-free crossings with mismatch, fits without it from four
+offsets had 1.9 to 12, within 12 % of each other."""
 _ACCEPTED_Z, _ACCEPTED_EXCESS = 3.0, 0.05
 """Limits of chi2 above one for an accepted minimum: chance in standard deviations, plus errors of
 the noise model."""
@@ -103,7 +104,7 @@ class Optimum(NamedTuple):
     starts: int
     """Number of offsets from which all parameters were freed."""
     stopped_by_friction: bool = False
-    """Whether a search with full suspension weight was abandoned for clear friction."""
+    """Whether a search with full weight of the suspension equations was abandoned for friction."""
     differs: bool = False
     """Whether a search without mismatch was abandoned for a clear one."""
     unfinished: SearchStrategy | None = None
@@ -116,8 +117,8 @@ class Optimum(NamedTuple):
 def chi2_per_dof(problem: PosteriorProblem, y: FloatArray) -> float:
     """Return the mean square of whitened residuals at y (size,), per degree of freedom.
 
-    Each search coordinate and each removed wave takes one. With reduced suspension weight only the
-    profile residuals count, and a third of these.
+    Each search coordinate and each removed wave takes one. With reduced weight of the suspension
+    equations only the mismatch residuals count, and a third of these coordinates and waves.
     """
     rows = data_rows(problem, y[None, :])[0, :: chi2_stride(problem)]
     taken = (y.size + problem.noise.lines.shape[1]) / chi2_stride(problem)
@@ -215,7 +216,7 @@ def fit_all(
     Negative stiffness and damping coordinates are fixed at zero, and the others brought to the
     neighbouring optimum. The remaining gradient belongs to the `normal_approximation`.
 
-    Suspension residuals and suspension weight depend on each other: with low weight the truck need
+    The suspension residuals and their weight depend on each other: with low weight the truck need
     not fit. So the first fit has full weight, reduced only where the body equations then leave more
     than sensor noise. A strategy with full weight ends without optimum at clear friction.
     """
@@ -234,7 +235,9 @@ def fit_all(
     )
     at_full_weight = _at_full_weight(at_full_weight, y)
     problem = update_noise(at_full_weight, y)
-    has_friction = problem.force.any() and suspension_weight(problem, y) < _CLEAR_FRICTION_WEIGHT
+    has_friction = (
+        problem.force.any() and suspension_equation_weight(problem, y) < _CLEAR_FRICTION_WEIGHT
+    )
     if strategy.uses_suspension and has_friction:
         return None, evaluations
     is_reduced = has_friction or (problem.force.any() and not strategy.uses_suspension)
@@ -311,7 +314,7 @@ def _at_full_weight(problem: PosteriorProblem, y: FloatArray) -> PosteriorProble
 def _fit_at_misfit(
     problem: PosteriorProblem, y: FloatArray, directions: FloatArray
 ) -> tuple[PosteriorProblem, FloatArray, Termination, int]:
-    """Fit along `directions` (f, d) with reduced suspension weight, unless y is far off."""
+    """Fit along `directions` (f, d) at reduced weight of the suspension, unless y is far off."""
     if chi2_per_dof(problem, y) > FAR_OFF_CHI2:
         return problem, y, Termination.STEPS_EXHAUSTED, 0
     return _fit_in_noise_rounds(problem, y, directions, _MAX_ROUNDS, _at_misfit)

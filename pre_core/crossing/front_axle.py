@@ -1,18 +1,18 @@
-"""Noise by the front axle of a truck with a tandem, on whose profile no sensor is.
+"""Noise from the front axle of a truck with a tandem, whose own profile is not measured.
 
 The inertia force m_u z'' of that axle follows from the profile that the tandem found at the same
-place (`tandem.lead_motion`). Its tyres are on other strips, though: what its profile differs by,
-e(x), is unknown, and deflects the bridge under all axles by a force that is none of the truck's
-known ones. With the spectrum S_e of e the acceleration of the axle errs by one with the spectrum
-(2 pi f)^4 |H|² S_e(f/v)/v, H its response, and the residuals by the bridge's answer to
-m_u times that, while the axle is on the bridge: noise B B' of low rank K, as the force lasts for
-seconds and matters up to some 15 Hz only.
+place (`tandem.lead_motion`). Its tyres are on other strips, though: the difference e(x) of the
+profiles is unknown, and its inertia force deflects the bridge under all axles. With the spectrum
+S_e of e, the axle's acceleration has an error of the spectrum (2 pi f)^4 |H|² S_e(f/v)/v, H its
+response. While the axle is on the bridge, the residuals contain the bridge's response to m_u times
+that error: noise B B' of low rank K, as the force lasts for seconds and matters up to about 15 Hz
+only.
 
 Residuals w that are white but for this noise are whitened by
 
     w - C C' w,    C = U diag(1 - (1 + s²)^-1/2)^1/2,    B = U diag(s) V',
 
-because cov(w) = I + B B'. In the few bands in which the bridge answers, the noise is many times
+because cov(w) = I + B B'. In the few bands in which the bridge responds, the noise is many times
 that of the sensors; it would be taken for damping or for support springs. All runs over one lane
 have the same e, so that it does not average out: in a fusion its power counts `RUNS` times.
 """
@@ -48,7 +48,7 @@ _JITTER = 1e-9
 def without_front_axle(
     problem: PosteriorProblem, y: FloatArray, noise: Whitener, runs: float = 1.0
 ) -> Whitener:
-    """Return the whitener with the noise by the front axle at y (size,), `runs` times its power.
+    """Return the whitener with the front axle's noise at y (size,), `runs` times its power.
 
     `noise` is that of the other sources. It is returned as it is for a truck without a tandem, or
     without road off the bridge that shows how rough the surface is.

@@ -133,10 +133,10 @@ def folded_hz(hz: float, apart_s: float) -> float:
 
 
 def unfolded_hz(signals: FloatArray, step_s: float, apart_s: float, hz: float) -> float:
-    """Return the frequency in Hz of signals (k, n) whose alias in the rows is a line at `hz`.
+    """Return the frequency in Hz of signals (k, n) whose alias in the residuals is a line at `hz`.
 
-    Signals are `step_s` apart and rows `apart_s`. Of the frequencies with this alias, the one with
-    the strongest line in any signal is returned.
+    Signals are `step_s` apart and residuals `apart_s`. Of the frequencies with this alias, the one
+    with the strongest line in any signal is returned.
     """
     count = signals.shape[1]
     at = np.arange(count // 2 + 1, dtype=np.float64) / (count * step_s)

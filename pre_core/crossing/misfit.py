@@ -1,4 +1,4 @@
-"""The part of a crossing that the model does not explain: the bridge, or the truck and its road."""
+"""Location of a misfit: on the bridge, or in the truck and its road."""
 
 from typing import NamedTuple
 
@@ -13,8 +13,9 @@ from pre_core.search.levenberg_marquardt import minimise
 
 EXPLAINED_CHI2 = 1.5
 """Value of `OffBridgeFit.chi2` up to which truck and road are explained. Where another vehicle, a
-wrong span or an undeclared support acted on the bridge it was 1.0; with full suspension weight and
-one profile 25 or more where springs or profiles of sound crossings needed another model."""
+wrong span or an undeclared support acted on the bridge it was 1.0. With full weight of the
+suspension equations and one profile it was 25 or more where springs or profiles of fault-free
+crossings needed another model."""
 _STEPS, _GAIN = 12, 10.0
 """Limit of steps, and the gain in the sum of squares that ends the fit, whose chi2 is judged
 coarsely."""

@@ -50,16 +50,17 @@ _NOTHING = 1e-12
 
 
 class MismatchSpectra(NamedTuple):
-    """Spectra (s, g) on an even grid (g,) of cycles/m from zero, one at 0.1 cycles/m.
+    """Spectra (s, g) on an even grid (g,) of cycles/m from zero, normalised at 0.1 cycles/m.
 
-    So a level A_j is its shape's spectrum there.
+    There each is one, so that a level A_j is the spectrum of its shape at 0.1 cycles/m.
     """
 
     cycles_per_m: FloatArray
     density: FloatArray
     """The spectrum of d, windowed."""
     front_cross_spectrum_density: FloatArray
-    """Cross spectrum (s, g) of the front axle's profile with d. The rear's is that less d's."""
+    """Cross spectrum (s, g) of the front axle's profile with d. That of the rear axle is this one
+    less the spectrum of d."""
     footprints: tuple[Footprint, Footprint]
     road: FloatArray
     """Windowed profile spectrum (g,) of the front axle on a surface of Phi k^3 = 1 m²."""

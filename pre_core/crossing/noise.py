@@ -1,15 +1,15 @@
 """Propagation of sensor noise, suspension noise and profile mismatch to the residuals.
 
-Three residuals are taken at every row, all as displacements: the profile mismatch and the two body
-equations divided by k_s (by a constant with reduced suspension weight: `body_divisors`). White
+There are three kinds of residuals, all as displacements: the profile mismatch and the two body
+equations divided by k_s (by a constant where their weight is reduced: `body_divisors`). White
 acceleration noise of densities n_s, n_u enters them as
 
     s^2 R_i   : [1 + (m_u s^2 + c_s s + k_s)/K] n_u - [(c_s s + k_s)/K] n_s,  K = k_u + c_u s
     s^2 b_i   : [(m_ii s^2 + c_s s)/k_s + 1] n_s - [c_s s/k_s + 1] n_u + [m_12 s^2/k_s] n_s'
 
 (front less rear in the mismatch; n_s' is the noise of the other body sensor). The front's residuals
-of a row are taken when the front wheel was at the rear wheel's present place, so that a sensor in
-both counts as two.
+are taken when the front wheel was at the rear wheel's present place, so that a sensor in both
+counts as two.
 
 Friction and nonlinear dampers put a force into the body equations that is noise of its own, of a
 level that the residuals determine (`force_noise`). The mismatch is then computed from inertia
@@ -60,11 +60,11 @@ _EVEN_NOISE_RATIO = 3.0
 declared density has up to 1.6 before the truck is found; friction, bilinear dampers and mismatch 4
 to 100."""
 _SUSPENSION_BAND_HZ = 30.0
-"""Highest frequency of the suspension weight."""
+"""Highest frequency in the weight of the suspension equations."""
 FRICTION_GAIN, FRICTION_GAIN_OF_MISFIT = 60.0, 15.0
-"""Gain in twice the log-likelihood of an axle's residuals that reduces its suspension weight: the
-second where nothing else explains a misfit. Of 400 axles with sensor noise alone twelve gained more
-than 15, none more than 60."""
+"""Gain in twice the log-likelihood of an axle's residuals that reduces the weight of its suspension
+equations: the second where nothing else explains a misfit. Of 400 axles with sensor noise alone
+twelve gained more than 15, none more than 60."""
 _EQUAL_TYRES = 0.05
 """Sensitivity to the mismatch of unequal tyres below which tyres count as equal; the visible part
 is then an axle's offset, whose long waves are twice as large, and short ones hardly distinguish
@@ -226,7 +226,7 @@ def _force_noise_spectra(truck: NoisePath, force: FloatArray, omega: FloatArray)
 
 
 class _AliasedBands(NamedTuple):
-    """Bands up to half the rate of the rows, and those that alias to them."""
+    """Bands up to half the rate of the residuals, and those that alias to them."""
 
     below: FloatArray
     above: FloatArray
@@ -252,7 +252,7 @@ def _folded_spectrum(
     force: FloatArray,
     road: Mismatch | None,
 ) -> NDArray[np.complex128]:
-    """Return spectra of the rows (f, 3, 3), including aliases."""
+    """Return spectra of the residuals (f, 3, 3), including aliases."""
     both = np.concatenate([at.below, at.above])
     power = np.concatenate([at.power_below, at.power_above])
     whole = noise_spectrum(truck, density, force, road, both) * power
@@ -268,10 +268,10 @@ def noise_power(
     which: list[int],
     road: Mismatch | None = None,
 ) -> FloatArray:
-    """Return tr(C_0^-1 C) per row for other trucks, less that of the first: (w,).
+    """Return tr(C_0^-1 C) per residual sample for other trucks, less that of the first: (w,).
 
     `which` (w,) counts from the second truck on; `density` is (trucks, 4), `force` (2, shapes). The
-    rows' spectra are those of an endless record, aliased at half the rate of the rows.
+    spectra are those of an endless record of residuals, aliased at half their rate.
     """
     at = _folded(rows, _FEW_FREQUENCIES)
     folded = partial(_folded_spectrum, at, force=force, road=road)
@@ -293,7 +293,7 @@ def mismatch_power(
     wheelbase_m: float,
     which: list[int],
 ) -> FloatArray:
-    """Return E[r' C_0^-1 (r_k - r)] per row by the mismatch alone: (w,).
+    """Return E[r' C_0^-1 (r_k - r)] per residual sample by the mismatch alone: (w,).
 
     The wheels respond to their own profiles, so that the mismatch is both in the residuals and in
     the accelerations: errors in variables, which would bias towards trucks that respond less to it.
@@ -436,10 +436,10 @@ def noise_power_ratio(
     return float(top.min()) if np.all(low < _EVEN_NOISE_RATIO * top) else 1.0
 
 
-def suspension_weight(
+def suspension_equation_weight(
     rows: RowFilter, truck: NoisePath, density: FloatArray, force: FloatArray
 ) -> float:
-    """Return the suspension weight: the mean share, 0 to 1, of sensor noise in the body equations.
+    """Return the weight of the suspension equations: the mean share (0 to 1) of sensor noise.
 
     `density` (4,) is that of the sensors, `force` (2, shapes) the suspension noise in N²/Hz.
     """

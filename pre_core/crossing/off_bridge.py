@@ -55,13 +55,13 @@ def _levels_off_bridge(
     if not some:
         nothing = np.zeros_like(problem.mismatch.level_m3)
         return nothing, 0.0, nothing
-    differ, felt = filtered_rows(problem, y)[0], filtered_rear_road(problem, y)
+    differ, rear_profile = filtered_rows(problem, y)[0], filtered_rear_road(problem, y)
     return mismatch_levels(
         problem.rows,
         *noise_path_at(problem, y),
         problem.mismatch,
         [differ[one] for one in some],
-        [felt[one] for one in some],
+        [rear_profile[one] for one in some],
     )
 
 

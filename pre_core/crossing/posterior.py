@@ -102,7 +102,7 @@ class PosteriorProblem(NamedTuple):
     noise_slope: FloatArray  # of the first coordinates: see `all_rows`
     works: tuple[Buffers, ...]
     lines_hz: tuple[float, ...] = ()
-    """Frequencies in the rows of the removed lines, see `lines`."""
+    """Frequencies in the residuals of the removed lines, see `lines`."""
     line_waves: FloatArray = np.zeros((0, 0))
     """(m, w) orthonormal waves of these lines."""
     front_axle: MismatchSpectra | None = None
@@ -265,11 +265,13 @@ def noise_path_at(problem: PosteriorProblem, y: FloatArray) -> tuple[NoisePath, 
     return truck, problem.density * (1.0 + at.gain[0])
 
 
-def suspension_weight(problem: PosteriorProblem, y: FloatArray) -> float:
-    """Return the suspension weight, 0 to 1, of the truck at y (size,); 0 if equalised."""
+def suspension_equation_weight(problem: PosteriorProblem, y: FloatArray) -> float:
+    """Return the weight of the suspension equations, 0 to 1, at y (size,); 0 if equalised."""
     if has_tandem(problem) and problem.crossing.lead.is_equalised:
         return 0.0
-    return _noise.suspension_weight(problem.rows, *noise_path_at(problem, y), problem.force)
+    return _noise.suspension_equation_weight(
+        problem.rows, *noise_path_at(problem, y), problem.force
+    )
 
 
 def noise_power_ratio(problem: PosteriorProblem, y: FloatArray) -> float:

@@ -84,8 +84,8 @@ class GriddedCrossing(NamedTuple):
     sinc: FloatArray  # (phases + 1, 2, taps): see `sinc_table`
     step: FloatArray  # (phases + 1, 2 reach): see `step_table`
     is_inertial: bool
-    """Whether the tyre force is computed from the masses above it; with suspension weight it is
-    computed from springs, dampers and the axle, which differs by the body equations."""
+    """Whether the tyre force is computed from the masses above it rather than from springs, dampers
+    and axle; the results differ by the body equations."""
     swing_sample: int
     """Sample of `EvaluationPoints.swing`, more than a step's reach before the entry."""
     torsion: TorsionBasis = NO_TORSION
@@ -241,8 +241,8 @@ def _wheels(
         for i in range(n):
             inertial = m_ii * a_s[i] + m_12 * a_other[i]
             load[i] = sign * transfer * speeding[i] - weight - inertial - m_u * a_u[i]
-        # The tyre force accelerates the masses above it, whatever springs are between; with
-        # suspension weight, springs give the same with far less noise of the body sensors.
+        # The tyre force accelerates the masses above it, whatever springs are between; where these
+        # are linear, they give the same with far less noise of the body sensors.
         force = work.sharp[w]  # not in use yet
         if crossing.is_inertial:
             for i in range(n):

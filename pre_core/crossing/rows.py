@@ -1,4 +1,4 @@
-"""Rows, the filtered residuals: low-passed, decimated and differenced twice by one FIR filter.
+"""Filtered residuals (`rows`): low-passed, decimated and differenced twice by one FIR filter.
 
 White noise of an acceleration is then stationary, with a covariance that vanishes beyond the
 filter's length.
@@ -25,7 +25,7 @@ _TABLE = 1024  # frequencies of the numerical integral over the noise spectrum
 
 
 class RowFilter(NamedTuple):
-    """Low-pass, decimation and second difference in one: row k covers samples from k `every`."""
+    """Low-pass, decimation and second difference in one: output k covers samples from k `every`."""
 
     taps: FloatArray
     every: int
@@ -59,7 +59,7 @@ def row_filter(step_s: float) -> RowFilter:
 
 
 def row_count(rows: RowFilter, samples: int) -> int:
-    """Return the number of rows that lie completely within `samples` samples."""
+    """Return the number of filtered residuals that lie completely within `samples` samples."""
     return max(0, (samples - rows.taps.size) // rows.every + 1)
 
 
@@ -75,7 +75,7 @@ def filter_rows(taps: FloatArray, every: int, x: FloatArray, out: FloatArray) ->
 
 
 def phases(rows: RowFilter, memory_s: float) -> NDArray[np.complex128]:
-    """Return phases (f, lags) between rows, for noise with a correlation time `memory_s` in s."""
+    """Return phases (f, lags) between residuals, for noise of correlation time `memory_s` in s."""
     if memory_s == 0.0:
         return rows.turn
     apart = rows.every * rows.step_s

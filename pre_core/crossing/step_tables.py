@@ -13,7 +13,7 @@ PHASES = 64
 SINC_TAPS = 16
 """Number of samples that interpolate a signal between two samples."""
 STEP_REACH = 8
-"""Samples to either side that a band-limited step rings."""
+"""Number of samples to either side over which a band-limited step rings."""
 
 
 def step_table() -> FloatArray:

@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 REDUCED_WEIGHT_SPRING_N_PER_M = 4e5
-"""Divisor of body equations with reduced suspension weight. Divided by the estimated stiffness, the
-suspension noise would decrease with it: a bias that can be corrected only as well as its level is
+"""Divisor of body equations with reduced weight. Divided by the estimated stiffness, the suspension
+noise would decrease with it: a bias that can be corrected only as well as its level is
 known. (Friction of 2 to 10 %: EI 0.4 standard deviations too low.) With full weight the divisor is
 the stiffness: the sensor noise is known."""
 REDUCED_WEIGHT_FACTOR = 100.0

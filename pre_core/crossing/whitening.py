@@ -33,13 +33,13 @@ class Whitener(NamedTuple):
     factor: FloatArray  # (3 m, band + 1): row i holds columns i - band … i
     reciprocal: FloatArray  # (3 m,) of the diagonal
     lines: FloatArray = np.zeros((0, 0))
-    """(3 m, w) orthonormal columns that are taken out of white rows, see `lines`."""
+    """(3 m, w) orthonormal columns that are taken out of white residuals, see `lines`."""
     low_rank: FloatArray = np.zeros((0, 0))
     """(3 m, k) columns C, after which w - C C'w are white, see `front_axle`."""
 
 
 def project_out_noise(noise: Whitener, white: FloatArray) -> FloatArray:
-    """Return white rows (k, 3 m) without the removed lines, and whitened for noise of low rank."""
+    """Return white residuals (k, 3 m) without the removed lines, whitened for noise of low rank."""
     for columns in (noise.lines, noise.low_rank):
         if columns.size:
             white = project_out(columns, white)
@@ -192,7 +192,7 @@ def whiten_into(
 def white_rows(rows: RowFilter, noise: Whitener, residuals: FloatArray) -> FloatArray:
     """Return whitened residuals (…, 3 m) of residuals (…, 3, n): filtered and interleaved.
 
-    Their variance is one. Raise ValueError if the whitener is for another number of rows.
+    Their variance is one. Raise ValueError if the whitener is for another number of residuals.
     """
     *many, kinds, n = residuals.shape
     count = row_count(rows, n)

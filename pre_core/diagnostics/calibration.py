@@ -1,9 +1,9 @@
 """Calibration of a method's intervals by many crossings of known truth.
 
-Each function takes errors or ranks and returns their deviation from calibrated ones. Ranks
-and normal scores of one crossing are dependent (its elements share a scale error, neighbours trade
-rigidity), so standard errors are taken between crossings, and a group of parameters is tested
-parameter by parameter.
+Each function takes errors or ranks and returns their deviation from calibrated ones. Ranks and
+normal scores of one crossing are dependent (its elements share a scale error, errors of neighbours
+are anticorrelated), so standard errors are taken between crossings, and a group of parameters is
+tested parameter by parameter.
 """
 
 from typing import NamedTuple

@@ -1,7 +1,7 @@
 """The noise density of an accelerometer, from a stretch of its samples.
 
 At standstill nearly all that a sensor shows is its noise; lines of an engine are few, and the
-median over frequencies does not see them. While driving only what lies above the wheels' motion is
+median over frequencies ignores them. While driving only what lies above the wheels' motion is
 noise, of a sensor of at least 400 Hz.
 """
 
@@ -35,7 +35,7 @@ class NoiseSegment(NamedTuple):
 
 
 class Density(NamedTuple):
-    """One-sided density of a stretch."""
+    """One-sided noise density of a stretch of samples."""
 
     ug_per_rthz: float
     falls_with_frequency: float

@@ -3,8 +3,8 @@
 With different wheel paths a single crossing determines its longitudinal offset to half a metre and
 elements only roughly, and its optimum lies near the priors. A normal about that point lacks the
 second-order terms from there to the truth. They are the same in all crossings of a survey, so that
-their number does not average them out. These terms are therefore kept too, as few
-sums of them as are significant, and fusion linearises each crossing again about the common
+their number does not average them out. These terms are therefore kept too, compressed
+to the few significant sums, and fusion linearises each crossing again about the common
 estimate.
 """
 

@@ -2,7 +2,7 @@
 
 The runs of a wheel-path group are first aligned along the road: receivers err by about the length
 of the waves that show the wander. The road profile aligns them to centimetres. The shared fraction
-is the mean product of two runs' mismatches over the power that the estimated levels claim, so that
+is the mean product of two runs' mismatches over the power that the estimated levels imply, so that
 the noise of the sensors, independent between runs, does not count as mismatch.
 """
 

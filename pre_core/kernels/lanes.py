@@ -1,6 +1,6 @@
 """Operations on four numbers at once: the vocabulary of the vector kernels.
 
-A `Lanes` is a tuple of four floats, one for each of four particles (or four modes). In this form
+A `Lanes` is a tuple of four floats, one for each of four parameter vectors (or modes). In this form
 numba's compiler keeps each tuple in one 256-bit register, which it does not achieve for short inner
 loops over arrays. None of the functions allocates.
 """
@@ -32,7 +32,7 @@ _inlined = partial(compiled, error_model="numpy", forceinline=True)
 exact = _inlined()
 
 # Contraction allows fused multiply-add; no other reordering of the arithmetic is allowed, so that
-# results depend only to rounding on which particles are evaluated together.
+# results depend only to rounding on which vectors are evaluated together.
 kernel = _inlined(fastmath={"contract", "nsz"})
 
 # For sums over many terms, which may be taken in any order.

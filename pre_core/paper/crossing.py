@@ -39,8 +39,8 @@ def paper_window(
     reach = np.ceil(car.wheelbase_m) + 1.0
     begin, end = experiment.FRONT_AXLE_START_M - reach, np.ceil(span + reach)
     profile = iso_8608_profile(begin, end, 0.01, *road)
-    felt = under_wheels(profile, motion, car.wheelbase_m, 1)
-    run = simulate(car, beam, motion, felt, experiment.STEP_S)
+    ground = under_wheels(profile, motion, car.wheelbase_m, 1)
+    run = simulate(car, beam, motion, ground, experiment.STEP_S)
     if not run.converged:
         raise ArithmeticError("the simulation did not converge")
     acceleration = np.ascontiguousarray(run.acceleration_m_per_s2.T)

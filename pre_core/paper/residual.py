@@ -4,7 +4,7 @@ r_i = u_i - y_i (IEP less DRS) at each wheel; R_1(x) - R_2(x) vanishes for the r
 J = integral of (R_1 - R_2)^2 dx (paper eq. 21). A `PaperWindow` holds everything that does not
 depend on the parameters.
 
-Longer than other modules: J of four particles, J of one, residuals and roads share the work arrays,
+Longer than other modules: J of four vectors, J of one, residuals and roads share the work arrays,
 and numba notices a changed kernel only in the same file.
 """
 
@@ -36,7 +36,7 @@ from pre_core.physics.vehicle import masses_above_axles, masses_on_axles
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_LONGEST_STRETCH = 128  # steps: four particles' work arrays of one stretch stay in the L1 cache
+_LONGEST_STRETCH = 128  # steps: four vectors' work arrays of one stretch stay in the L1 cache
 _STENCIL = 2  # samples to either side that the cubic interpolation needs
 
 
@@ -313,13 +313,13 @@ def _wheels(
 
 
 @kernel
-def march_particles(
+def march_four(
     window: PaperWindow, work: Workspace, theta: FloatArray, limit: FloatArray, total: FloatArray
 ) -> None:
-    """Compute J of four particles `theta` (4, p) to `total` (4,); roads stay in `work.road`.
+    """Compute J of four vectors `theta` (4, p) to `total` (4,); roads stay in `work.road`.
 
-    An evaluation stops early once every particle's J has passed its `limit` (4,), which decides a
-    comparison J <= limit exactly; `total` then exceeds the limit. It is infinite if not finite.
+    An evaluation stops early once the J of every vector has passed its `limit` (4,), which decides
+    a comparison J <= limit exactly; `total` then exceeds the limit. It is infinite if not finite.
     """
     total[:] = np.inf
     for i in range(theta.shape[0]):
@@ -379,7 +379,7 @@ def march_particles(
 
 @kernel
 def _rows(window: PaperWindow, road: FloatArray, lane: int, out: FloatArray) -> None:
-    """Write weighted residuals of one particle to `out` (m,), nuisance columns not yet removed."""
+    """Write weighted residuals of one vector to `out` (m,), nuisance columns not yet removed."""
     front, rear = road[0], road[1]
     for row in range(out.size):
         n = window.front_sample[row]
@@ -393,7 +393,7 @@ def _rows(window: PaperWindow, road: FloatArray, lane: int, out: FloatArray) -> 
 def objective_batch(
     window: PaperWindow, work: Workspace, theta: FloatArray, limit: FloatArray, total: FloatArray
 ) -> None:
-    """Compute J of many particles by fours: `theta` (k, p), `limit` (k,), output `total` (k,)."""
+    """Compute J of many vectors by fours: `theta` (k, p), `limit` (k,), output `total` (k,)."""
     count = theta.shape[0]
     four = np.empty((LANES, theta.shape[1]))
     four_limit = np.empty(LANES)
@@ -403,7 +403,7 @@ def objective_batch(
             source = min(begin + lane, count - 1)
             four[lane] = theta[source]
             four_limit[lane] = limit[source]
-        march_particles(window, work, four, four_limit, four_total)
+        march_four(window, work, four, four_limit, four_total)
         for lane in range(min(LANES, count - begin)):
             total[begin + lane] = four_total[lane]
 
@@ -419,7 +419,7 @@ def _residual_batch(
         for lane in range(LANES):
             four[lane] = theta[min(begin + lane, count - 1)]
         totals = np.empty(LANES)
-        march_particles(window, work, four, no_limit, totals)
+        march_four(window, work, four, no_limit, totals)
         for lane in range(min(LANES, count - begin)):
             if np.isfinite(totals[lane]):
                 _rows(window, work.road, lane, out[begin + lane])
@@ -477,7 +477,7 @@ def objective(window: PaperWindow, work: Workspace, theta: FloatArray) -> float:
     front, rear = work.road[0], work.road[1]
     for part in range(window.stretches.shape[0]):
         begin, stop, e1, e2 = window.stretches[part]
-        _one_particle_stretch(window, work, factors, begin, stop, scratch)
+        _one_vector_stretch(window, work, factors, begin, stop, scratch)
         advance(filters, _wheels(window, work, begin, stop, e1, e2))
         for n in range(begin, stop):
             front[n, 0] = (front[n, 0] + front[n, 1]) + (front[n, 2] + front[n, 3])
@@ -497,7 +497,7 @@ def objective(window: PaperWindow, work: Workspace, theta: FloatArray) -> float:
 
 
 @kernel
-def _one_particle_stretch(
+def _one_vector_stretch(
     window: PaperWindow,
     work: Workspace,
     factors: FloatArray,
@@ -554,7 +554,7 @@ class ImpliedProfiles(NamedTuple):
 def road_profiles(window: PaperWindow, work: Workspace, theta: FloatArray) -> ImpliedProfiles:
     """Return the profiles under both wheels (m,) at the residuals' chainages, for theta (p,)."""
     four = np.repeat(theta[None, :], LANES, axis=0)
-    march_particles(window, work, four, np.full(LANES, np.inf), np.empty(LANES))
+    march_four(window, work, four, np.full(LANES, np.inf), np.empty(LANES))
     front = -work.road[0, :, 0]
     gathered = front[window.front_sample[:, None] + np.arange(4)]
     rear = -work.road[1, window.first_row : window.first_row + window.x_m.size, 0]
@@ -566,6 +566,6 @@ def deflections_m(window: PaperWindow, theta: FloatArray) -> FloatArray:
     """Return the deflection (2, n) of the bridge under front and rear wheel, positive downwards."""
     work = workspace(window)
     four = np.repeat(theta[None, :], LANES, axis=0)
-    march_particles(window, work, four, np.full(LANES, np.inf), np.empty(LANES))
+    march_four(window, work, four, np.full(LANES, np.inf), np.empty(LANES))
     # That array holds minus r, and y = u - r.
     return np.asarray(-input_profiles(window.signals, theta) - work.road[:, :, 0])

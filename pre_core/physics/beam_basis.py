@@ -60,7 +60,7 @@ class BeamBasis(NamedTuple):
 
 
 class ModalFilters(NamedTuple):
-    """The recursions of g modes or groups of modes; the last axis is particles or modes."""
+    """The recursions of g modes or groups of modes; the last axis is parameter vectors or modes."""
 
     cubics: FloatArray  # (parts, g, 4, 4): see `modal_filters`
     feedback: FloatArray  # (g, factors, 4)
@@ -182,7 +182,7 @@ def modal_filters(
 ) -> bool:
     """Compute the recursions of the modes of four bridges; return False if not finite.
 
-    `theta` is (4, p). Outputs: `cubics` (parts, m, 4, 4) [part, mode, power, particle], scaled by
+    `theta` is (4, p). Outputs: `cubics` (parts, m, 4, 4) [part, mode, power, vector], scaled by
     1/sqrt(b_0), and `feedback` (m, 2, 4), the factors of w[n-2] and d[n-1].
     """
     basis_stiffness, basis_cubics = basis.stiffness, basis.cubics
@@ -366,7 +366,7 @@ def _one_mode_one_wheel(
 
 @kernel
 def advance(filters: ModalFilters, wheels: WheelStretch) -> None:
-    """March all modes over a stretch: `filters.state` is updated, deflections are *added* to."""
+    """March all modes over a stretch: update `filters.state`, and *add* to the deflections."""
     front = filters.cubics[max(wheels.front, 0)]
     rear = filters.cubics[max(wheels.rear, 0)]
     feedback, state, force = filters.feedback, filters.state, wheels.force

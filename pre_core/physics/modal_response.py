@@ -222,7 +222,7 @@ def _no_wheel(feedback: FloatArray, state: FloatArray, steps: int) -> None:
 
 @kernel
 def advance(filters: ModalFilters, wheels: LoadedStretch) -> None:
-    """March all modes over a stretch: `filters.state` is updated, deflections are *added* to."""
+    """March all modes over a stretch: update `filters.state`, and *add* to the deflections."""
     cubics, feedback, state = filters.cubics, filters.feedback, filters.state
     place, force, deflection = wheels.place, wheels.force, wheels.deflection
     front, rear = wheels.front, wheels.rear

@@ -103,7 +103,7 @@ class OwnSprings(NamedTuple):
     """Distance o_2 of the tandem's first axle behind the front axle."""
     lever_2_m: float
     weight_1: float
-    """Share w of the moment that the springs leave, in 1/m."""
+    """Factor w_1 in 1/m from the moment that the springs do not carry to the first axle's force."""
     weight_2: float
 
 
@@ -118,7 +118,7 @@ def own_springs(lead: Lead, gap: float) -> OwnSprings:
 def friction_passage(
     lead: Lead, theta: FloatArray, gap: float, lag_s: float, omega: FloatArray
 ) -> FloatArray:
-    """Return the factor (f,) from friction's power in o_b F_b/o_b to that in R_1 - R_2, in m²/N².
+    """Return the factor (f,) from friction's power in F_b to that in R_1 - R_2, in m²/N².
 
     The first axle's profile is taken `lag_s` earlier. Zero for an equalised tandem.
     """

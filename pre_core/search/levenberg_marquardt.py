@@ -39,7 +39,7 @@ class DifferenceScheme(NamedTuple):
 
 
 FORWARD = DifferenceScheme(1e-6, central=False, converged_gain=1e-7, rounding=0.0)
-"""Scheme during the search: f evaluations, six digits. The others depend on the processor's
+"""Scheme during the search: f evaluations, six digits. The other digits depend on the processor's
 rounding and move the optimum by about 1e-6, little compared with a standard deviation of any real
 crossing."""
 

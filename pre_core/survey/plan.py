@@ -1,7 +1,7 @@
 """Information of a planned survey: likelihoods times numbers of crossings, plus priors.
 
 One crossing of the nominal truck over the nominal bridge, without noise but with all of it in the
-model, has the mean information of a driven one: J'J of its whitened residuals does not depend on
+model, has the mean information of a real one: J'J of its whitened residuals does not depend on
 the noise realisation. Deflection is linear in the compliances c = EI_nominal/EI
 (`crossing.compliances`), so that this is also the information on a damaged bridge.
 
@@ -190,7 +190,7 @@ def survey_spreads(
 def non_increasing(spreads: FloatArray) -> FloatArray:
     """Return the non-increasing columns closest to `spreads` (n, k) in least squares.
 
-    More crossings never widen a posterior: what rises between two rows is the error of a standard
+    More crossings never widen a posterior: an increase between two rows is an error of a standard
     deviation from a finite number of draws.
     """
     columns = [isotonic_regression(column, increasing=False).x for column in spreads.T]

@@ -131,7 +131,7 @@ class Fit(NamedTuple):
     """The most significant step in the delay or the gain of a channel."""
     mismatch_excess: float = 0.0
     """Power of the mismatch off the bridge, relative to that of the declared axles."""
-    led_by_mismatch: float = 0.0
+    mismatch_bias: float = 0.0
     """Largest correction of a truck's unknown for the mismatch, in multiples of its prior's
     spread."""
     pavement_ratio: float = 1.0
@@ -152,7 +152,7 @@ def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
     if (
         fit.mismatch_excess > _MISMATCH_EXCESS
         or fit.pavement_ratio > _LARGEST_PAVEMENT_RATIO
-        or is_misled_by_mismatch(fit)
+        or is_biased_by_mismatch(fit)
     ):
         reasons.append(Reason.MISMATCH_IMPLAUSIBLE)
     if abs(fit.position_z) > _LARGEST_POSITION_Z:
@@ -299,12 +299,12 @@ def loads_are_alike(vehicle: Vehicle) -> bool:
     return abs(front - rear) < ALIKE_LOADS * (front + rear)
 
 
-def is_misled_by_mismatch(fit: Fit) -> bool:
+def is_biased_by_mismatch(fit: Fit) -> bool:
     """Return whether the correction for the mismatch exceeds that of any truck.
 
     None of the fit's numbers can be used then.
     """
-    return fit.led_by_mismatch > _LED_AWAY
+    return fit.mismatch_bias > _LED_AWAY
 
 
 def undeclared_axles(

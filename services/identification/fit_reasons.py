@@ -24,7 +24,7 @@ from services.finding.placed import first_axle, middle_names
 from services.identification.checks import (
     Fit,
     coarse_converters,
-    is_misled_by_mismatch,
+    is_biased_by_mismatch,
     odd_parameters,
     reasons_after_fit,
     steps_of_channels,
@@ -70,7 +70,7 @@ def reasons_of_fit(
         Reason.IMPLAUSIBLE_VEHICLE: odd_parameters(fit),
         Reason.TANDEM_FRICTION: f"about {100.0 * fit.tandem_friction:.2g} % of their load",
     }
-    return ReasonsOfFit((*axles, *reasons), about, bool(slipped) or is_misled_by_mismatch(fit))
+    return ReasonsOfFit((*axles, *reasons), about, bool(slipped) or is_biased_by_mismatch(fit))
 
 
 def _place_of_misfit(found: Optimum) -> str:

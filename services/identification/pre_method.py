@@ -380,7 +380,7 @@ def _derived(
         probability_sprung=_probability_of(theta, parameters.K_ROT),
         probability_giving=_probability_of(theta, parameters.F),
         probability_torsion=float((theta[:, parameters.TORSION] > 0.0).mean()),
-        springs_believed=posterior.suspension_weight(problem, flat.mean(axis=0)),
+        springs_believed=posterior.suspension_equation_weight(problem, flat.mean(axis=0)),
         ei_level=_parameter("1", _level(data.bridge, scaled, 0.0, 1.0), None),
         ei_thirds=results.Thirds(
             **{

@@ -45,7 +45,7 @@ LONG_FUNCTIONS = {
     "pre_core.crossing.preparation:build_problem": 77,
     "pre_core.monitoring.change_detection:detect_change": 71,
     "pre_core.paper.residual:build_window": 87,
-    "pre_core.paper.residual:march_particles": 63,
+    "pre_core.paper.residual:march_four": 63,
     "pre_core.physics.march:march": 140,
     "services.ledger.recorded_crossings:scan_stays": 69,
     "services.identification.bridge_state:state_of": 69,

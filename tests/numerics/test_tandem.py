@@ -286,7 +286,7 @@ def test_friction_of_own_springs_is_found_in_the_moment() -> None:
     rough = update_noise(problem, y)
     # Springs that hardly slide: the friction changes by a part of its limit only.
     assert 0.005 < tandem_friction(rough, y) < 0.04
-    assert posterior.suspension_weight(rough, y) < 0.05
+    assert posterior.suspension_equation_weight(rough, y) < 0.05
     smooth, y = build_problem(inputs_of(driven(0.0, False)))
     assert tandem_friction(update_noise(smooth, y), y) < 0.001
     equalised, y = build_problem(inputs_of(driven()))

@@ -107,7 +107,7 @@ def test_a_truck_that_is_not_the_one_of_the_site_file() -> None:
     assert reasons_after_fit(crossing(), odd) == [Reason.IMPLAUSIBLE_VEHICLE]
 
 
-@pytest.mark.parametrize("field", ["mismatch_excess", "led_by_mismatch"])
+@pytest.mark.parametrize("field", ["mismatch_excess", "mismatch_bias"])
 def test_mismatch_that_no_declared_tyre_causes_is_named(field: str) -> None:
     assert reasons_after_fit(crossing(), fit(normals(), **{field: 20.0})) == []
     odd = fit(normals(), **{field: 60.0})
