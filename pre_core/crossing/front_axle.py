@@ -32,7 +32,7 @@ from pre_core.physics.tandem import lead_response
 FloatArray = NDArray[np.float64]
 
 RUNS: Final = 12.0
-"""Number of runs over one profile in which a fusion of them is exact, conservative with fewer."""
+"""Number of runs over one profile for which fusion is exact; it is conservative with fewer."""
 _HIGHEST_HZ = 15.0
 _LONGEST_KNOTS = 160
 """Largest number of values of a force; a slower truck's counts up to a lower frequency."""

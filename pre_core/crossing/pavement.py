@@ -25,7 +25,8 @@ from pre_core.crossing.whitening import Whitener, solve
 from pre_core.physics.bridge import FloatArray
 
 RATIO_SPREAD, TILT_SPREAD = 0.7, 0.12
-"""Standard deviations of r and t. Decks were 2.5 to 3.8 times as rough as the road before them."""
+"""Standard deviations of r and t. A measured deck was 2.5 to 3.8 times as
+rough as the road before it (studies/pavement.md)."""
 _SHORT_CYCLES_PER_M = (0.3, 4.0)
 """Wave numbers that no deflection of the bridge has, and that tyres do not average out."""
 _JOINT_M = 0.5

@@ -86,7 +86,7 @@ class CrossingInputs(NamedTuple):
     torsional_wave_speed_m_per_s: float = 0.0
     """Speed of torsional waves; positive where the deck may twist."""
     lane_factor: float = 1.0
-    """Square of this run's distance from the bridge's axis over that of the torsion's prior."""
+    """Squared ratio of this run's distance from the bridge's axis to that of torsion's prior."""
     lead: Lead = NO_LEAD
     """Front axle of a truck with a tandem. Fixes, wheelbase, footprints and the last two signals
     are then those of the tandem, whose first axle is the front one."""
@@ -370,7 +370,7 @@ def _displaced_points(
 
 
 def mismatch_gradient(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
-    """Return the part of the objective's gradient at `y` (size,) by the mismatch, shape (n,)."""
+    """Return the part of the gradient at `y` (size,) that the mismatch causes, shape (n,)."""
     where = layout(problem)
     is_inertial = bool(problem.force.any())
     at, trucks = _displaced_points(problem, y, where.delays.stop, is_inertial=is_inertial)

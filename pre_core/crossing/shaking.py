@@ -25,7 +25,7 @@ _FEWEST_PARTS = 3
 def coherence(problem: PosteriorProblem, y: FloatArray) -> float:
     """Return the real part of the coherence of both body equations' residuals, at the same time.
 
-    For the fit y (size,), from 3 to 12 Hz, each frequency as an acceleration. Zero for a record too
+    It is that of the fit y (size,), of accelerations from 3 to 12 Hz. Zero for a record too
     short for it.
     """
     crossing, rows = problem.crossing, problem.rows

@@ -251,8 +251,8 @@ def lead_motion(lead: Lead, step_s: float, profile: FloatArray, force: FloatArra
 
     `profile` includes the deflection of a bridge under the axle. `force` (n,) is that of its
     springs on the body, known by inertia: whatever friction there is, m_u z'' + k_u z = k_u u - F.
-    Near the resonance of axle and tyre, where this amplifies errors of the profile, less than the
-    whole answer is taken; waves below `_LEAD_BAND_HZ` are left out.
+    Near the resonance of axle and tyre, where this amplifies errors of the profile, the response is
+    attenuated; waves below `_LEAD_BAND_HZ` are left out.
     """
     n = profile.size
     ground = profile - force / lead.tyre_stiffness_n_per_m

@@ -93,9 +93,9 @@ def scan_offsets(
 ) -> tuple[list[Placement], int]:
     """Return candidates along the road about y (size,), best first, and the evaluations.
 
-    The fit improves towards the right offset from afar, so that the scan ends behind the best
-    place. The axles of a tandem are too close together for that: other minima metres away fit well
-    enough to be accepted, with a wrong bridge, and the whole reach of the receiver is scanned.
+    The fit improves towards the right offset from afar, so that the scan ends beyond the best one.
+    The axles of a tandem are too close together for that: other minima metres away fit well enough
+    to be accepted, with a wrong bridge, and the whole reach of the receiver is scanned.
     """
     local_fit = _local_fit(problem, y, strategy)
     nothing = np.zeros(layout(problem).bridge.size)

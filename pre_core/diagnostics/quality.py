@@ -163,7 +163,7 @@ def assign_channels(
 
     a_s + (c/m)(v_s - v_u) + (k/m)(z_s - z_u) + (m_12/m) a_s,other = 0 holds for the right channels
     on any road and bridge, and for hardly any others. c/m and k/m (2,) are free within a factor of
-    4 of their known values (front, rear), the coupling within 0.6. Between 0.7 and 10 Hz.
+    4 of their known values (front, rear), the coupling within 0.6. The band is 0.7 to 10 Hz.
     """
     spectrum, omega = _spectrum(acceleration_m_per_s2, step_s, _BODY_BAND_HZ)
     left: dict[tuple[int, int, int, int, bool], float] = {}

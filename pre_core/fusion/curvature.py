@@ -81,8 +81,8 @@ def linearise_with_curvature(
 ) -> tuple[FloatArray, FloatArray]:
     """Return root (m, p), target (m,) of the normal about a bridge `at` (b,), without the offset.
 
-    The given ones are of x = (bridge, p - b others, offset, terms), |root x - target|²/2. `priors`
-    is the precision (p - b, p - b) of the others, which determines the offset for `at`.
+    The inputs are those of x = (bridge, p - b others, offset, terms), |root x - target|²/2.
+    `priors` is the precision (p - b, p - b) of the others, which determines the offset for `at`.
     """
     b = bends.about.size
     k = bends.shapes.shape[0]

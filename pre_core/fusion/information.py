@@ -105,7 +105,7 @@ def leave_one_out_change(
 ) -> tuple[FloatArray, FloatArray]:
     """Return precision (e, e) and linear part (e,) of the deviation of one crossing from all.
 
-    Its own are `precision` and `linear`, and `across` (n, e) couples all n coordinates to them;
+    `precision` and `linear` are the crossing's own, and `across` (n, e) couples all n coordinates;
     `whole` are precision and linear part of the sum of all, this one included.
     """
     explained = np.linalg.solve(whole[0], np.column_stack([across, whole[1]]))

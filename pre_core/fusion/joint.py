@@ -2,7 +2,7 @@
 
 The coordinates are those of the bridge; of each truck, with its total mass; and, for each
 wheel-path group (a truck in one direction), the long waves of the shared mismatch, which do not
-average out. A crossing has of its own the other part of those waves, and a change of every
+average out. Each crossing has its own part of those waves, too, and its own change of every
 element's compliance: between crossings EI varies with temperature and with effects that the model
 lacks, by a relative standard deviation tau of which a share rho is common to all elements. Normal
 variables are integrated out; tau and rho are evaluated on a grid.

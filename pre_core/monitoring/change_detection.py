@@ -217,7 +217,7 @@ def detect_change(
 def compare_periods(first: Period, last: Period) -> PeriodDifference:
     """Compare two periods directly, temperature and season included.
 
-    Shared errors cancel; errors of one of them count.
+    Shared errors cancel; errors of one period alone count.
     """
     plain = [period._replace(temperature_deg_c=0.0) for period in (first, last)]
     motionless = Scales(np.zeros(1), np.zeros(1), np.ones(1), np.zeros(1))

@@ -18,7 +18,7 @@ moment,
 
     F_i = S_i + w_i (o_b F_b - o_2 S_2 - o_3 S_3),    w_i = o_i/(o_2² + o_3²).
 
-Friction f_i, which the law leaves out, is then seen in the moment as o_2 f_2 + o_3 f_3, and remains
+Friction f_i, which the law leaves out, then appears in the moment as o_2 f_2 + o_3 f_3, and remains
 as a force q on axle 2 and -q o_2/o_3 on axle 3, q = o_3 (o_3 f_2 - o_2 f_3)/(o_2² + o_3²). Friction
 of both axles that is independent and equally strong makes the two uncorrelated. (`Lead` selects.)
 """
