@@ -105,7 +105,7 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
         inputs.element_lengths_m,
         inputs.parts,
         interior_supports=inputs.interior_supports,
-        bearings_give=True,
+        has_compliant_bearings=True,
     )
     position, speeding, rows, values, best = trajectory_basis(
         inputs.fixes, inputs.start_s + model.start_s, model.step_s, n, inputs.direction, _KNOT_S

@@ -86,7 +86,7 @@ def beam_basis(
     coordinates: int | None = None,
     *,
     interior_supports: tuple[int, ...] = (),
-    bearings_give: bool = False,
+    has_compliant_bearings: bool = False,
 ) -> BeamBasis:
     """Return a beam in the lowest modes of the uniform beam, its n elements cut into `parts`.
 
@@ -94,11 +94,11 @@ def beam_basis(
     faster but poor for a beam that is not uniform or has springs at its supports, whose kinked
     curvature smooth modes do not span: f_1 of the paper's scenario 6 is 1 % off with 14 of 28.
     `element_lengths_m` is (n,); `interior_supports` are nodes between elements. With
-    `bearings_give` each end has a vertical spring.
+    `has_compliant_bearings` each end has a vertical spring.
     """
     n = element_lengths_m.size
     lengths = np.repeat(element_lengths_m / parts, parts)
-    give = (1.0, 1.0) if bearings_give else (0.0, 0.0)
+    give = (1.0, 1.0) if has_compliant_bearings else (0.0, 0.0)
     unit = uniform_beam(1.0, np.ones(n * parts), 1.0, 0.0, 0.0)._replace(
         element_lengths_m=lengths,
         support_compliance_m_per_n=give,
@@ -109,7 +109,7 @@ def beam_basis(
     count = fine.shape[1] if coordinates is None else min(coordinates, fine.shape[1])
     units = np.concatenate(
         [fine[: n * parts].reshape(n, parts, *fine.shape[1:]).sum(axis=1), fine[n * parts :]]
-    )[: n + 4 if bearings_give else n + 2]
+    )[: n + 4 if has_compliant_bearings else n + 2]
     # The springs, as stiff as an element of this length, only suppress rigid-body motion.
     reference = units[:n].sum(axis=0) + units[n + 2 :].sum(axis=0) * 12.0 / lengths[0] ** 3
     _, shapes = eigh(reference, mass_matrix(unit), subset_by_index=(0, count - 1))

@@ -107,7 +107,7 @@ def crossing(
     is_inertial: bool = True,
 ) -> GriddedCrossing:
     vehicle, bridge = case.site.vehicles[0], case.site.bridges[0]
-    basis = beam_basis(np.array(bridge.lengths_m), parts, bearings_give=True)
+    basis = beam_basis(np.array(bridge.lengths_m), parts, has_compliant_bearings=True)
     model = channel_signals(case.acceleration, 1.0 / case.rate_hz, case.rate_hz)
     front = point(case).position_m[0]
     first = int(np.searchsorted(np.abs(front - front[0]), vehicle.wheelbase_m + 1.0))

@@ -240,7 +240,7 @@ class Filters(NamedTuple):
 
 
 def filters(theta: FloatArray, lengths: FloatArray, interior: tuple[int, ...]) -> Filters:
-    basis = beam_basis(lengths, 2, interior_supports=interior, bearings_give=True)
+    basis = beam_basis(lengths, 2, interior_supports=interior, has_compliant_bearings=True)
     basis = change_basis(basis, theta)
     parts, _, m = basis.cubics.shape
     groups = -(-m // LANES)

@@ -337,7 +337,7 @@ def test_mirrored_crossing_gives_the_same_residuals(truth: Case) -> None:
 
     def one(direction: int) -> FloatArray:
         order = slice(None, None, direction)
-        basis = beam_basis(lengths[order], PARTS, bearings_give=True)
+        basis = beam_basis(lengths[order], PARTS, has_compliant_bearings=True)
         at = point(truth)
         at.theta[0] = theta
         at.theta[0, EI_1 : EI_1 + 7] = theta[EI_1 : EI_1 + 7][order]
