@@ -55,6 +55,8 @@ def reasons_of_fit(
     fit = _fit(data, found)
     names, densities = middle_names(data.vehicle), data.sensor.noise_density_ug_per_rthz
     slipped = steps_of_channels(names, fit)
+    if slipped and found.unfinished is not None and fit_off_bridge(found).chi2 <= EXPLAINED_CHI2:
+        slipped = {}  # a channel that steps would not be explained before and behind the bridge
     reasons = [*slipped, *reasons_after_fit(data, fit)]
     if found.ending is not Termination.CONVERGED:
         reasons.append(Reason.NOT_CONVERGED)
