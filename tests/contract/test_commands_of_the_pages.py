@@ -46,7 +46,7 @@ NOT_RUN = {
         "tests/unit/cli/test_cluster.py has a store"
     ),
     'pip install "driveby[history,s3]"': NETWORK,
-    'pip install --upgrade "driveby[all]"': NETWORK,
+    'pip install --upgrade "WHEEL[all]"': NETWORK,
     "pip uninstall driveby": "removes what this test runs in",
     "python -m tests.benchmarks.fleet --out /tmp/fleet": LONG,
     "python -m tests.benchmarks.alarms": LONG,
