@@ -74,15 +74,10 @@ class ResultStore:
         self._locations: dict[str, list[_RowLocation]] = {}
         """Rows with the result of an input: several, if one was damaged and computed again."""
         self._read: tuple[Path, tuple[tuple[bytes, bytes], ...]] | None = None
-        for path in files_of(folder):
-            try:
-                contents = _table(path, "content").column("content").to_pylist()
-            except ValueError as error:
-                self.problems.append(f"{path}: left out: {error}")
-                continue
-            named = ((row, name) for row, name in enumerate(contents) if isinstance(name, str))
-            for row, name in named:
-                self._locations.setdefault(name, []).append(_RowLocation(path, row))
+        for path, table in _tables(folder, self.problems.append, "content"):
+            for row, name in enumerate(table.column("content").to_pylist()):
+                if isinstance(name, str):
+                    self._locations.setdefault(name, []).append(_RowLocation(path, row))
 
     def __len__(self) -> int:
         return len(self._locations)
@@ -170,13 +165,8 @@ def _rows_of(
     """
     newest = _newest_of(folder)
     seen: set[str] = set()
-    for path in files_of(folder):
-        try:
-            rows = _table(path, "content", "header", "result").to_pylist()
-        except ValueError as error:
-            problem(f"{path}: left out: {error}")
-            continue
-        for number, row in enumerate(rows):
+    for path, table in _tables(folder, problem, "content", "header", "result"):
+        for number, row in enumerate(table.to_pylist()):
             if row["content"] in seen or row["content"] not in newest:
                 continue
             try:
@@ -193,12 +183,9 @@ def _newest_of(folder: Path) -> set[str]:
     """Return the hashes of the newest results; unreadable rows are reported by the caller."""
     newest: dict[tuple[str, ...], tuple[float, str]] = {}
     unknown: set[str] = set()
-    for path in files_of(folder):
-        try:
-            rows = _table(path, "content", "crossing_id", "realm", "header").to_pylist()
-        except ValueError:
-            continue
-        for row in rows:
+    columns = ("content", "crossing_id", "realm", "header")
+    for _, table in _tables(folder, lambda _: None, *columns):
+        for row in table.to_pylist():
             content = row["content"]
             try:
                 header = _header_of(row["header"])
@@ -241,6 +228,19 @@ def _text_of(compressed: bytes) -> bytes:
     if not 0 <= size <= _MAX_BYTES:
         raise ValueError(f"{size} bytes are no result")
     return zstandard.decompress(compressed)
+
+
+def _tables(
+    folder: Path, problem: Callable[[str], object], *columns: str
+) -> Iterator[tuple[Path, "pa.Table"]]:
+    """Yield columns of all files of results; call `problem` with a line for an unreadable one."""
+    for path in files_of(folder):
+        try:
+            table = _table(path, *columns)
+        except ValueError as error:
+            problem(f"{path}: left out: {error}")
+        else:
+            yield path, table
 
 
 def _table(path: Path, *columns: str) -> "pa.Table":
