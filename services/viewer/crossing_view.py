@@ -25,6 +25,8 @@ VEHICLE_COLOURS = {
 }  # Okabe and Ito: distinguishable by all eyes
 TRUTH_COLOUR = "#000000"
 VERDICT_COLOURS = {"good": "#009E73", "suspect": "#B57A00", "rejected": "#C0392B"}
+BESIDE_S = 1.0
+"""Time in s shown before the entry and after the exit of a crossing."""
 
 
 class CrossingSpan(Protocol):
@@ -185,6 +187,17 @@ class CrossingView(NamedTuple):
     def interval_has_meaning(self) -> bool:
         """Whether the method has a noise model, without which an interval means nothing."""
         return "no_noise_model" not in self.reasons
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the result must not be relied upon."""
+        return self.verdict != "good" or not self.interval_has_meaning
+
+
+def front_axle_chainage(crossing: CrossingSpan, time_s: FloatArray) -> FloatArray:
+    """Return the front axle's chainage (n,), m, at the mean speed: for display only."""
+    travelled = crossing.speed_m_per_s * (time_s - crossing.entry_time_s)
+    return travelled if crossing.forward else crossing.span_m - travelled
 
 
 def summary_line(view: CrossingView) -> str:

@@ -8,11 +8,12 @@ from typing import Final
 import rerun as rr
 import rerun.blueprint as rrb
 
-from services.viewer.layout import acceleration_plots, bridge_places
 from services.viewer.live_parts import ROADS_MIDDLE, ROADS_REACH
-from services.viewer.rerun_parts import TIME
+from services.viewer.panels.place import bridge_places
+from services.viewer.panels.signals import acceleration_plots
+from services.viewer.rerun_parts import TIME, flat_view
 from services.viewer.rerun_places import BridgeOnMap
-from services.viewer.strip import STRIP_PAPER, STRIP_WIDTH
+from services.viewer.strip import STRIP_WIDTH
 
 WINDOW_S: Final = 60.0
 """Time in s of accelerations and crossings before the cursor."""
@@ -89,14 +90,11 @@ def _truck(vehicle: str, channels: Set[str]) -> rrb.Container:
 
 def _bridge(bridge: str) -> rrb.Container:
     wording = rrb.TextDocumentView(origin=f"said/{_part(bridge)}", name="Newest result")
-    strip = rrb.Spatial2DView(
-        origin=f"{result_root(bridge)}/strip",
-        name="EI / nominal along the span, 95 % interval; road",
-        background=STRIP_PAPER,
-        visual_bounds=rrb.VisualBounds2D(
-            x_range=(-20.0, STRIP_WIDTH + 150.0),
-            y_range=(-20.0, ROADS_MIDDLE + ROADS_REACH + 80.0),
-        ),
+    strip = flat_view(
+        f"{result_root(bridge)}/strip",
+        "EI / nominal along the span, 95 % interval; road",
+        (-20.0, STRIP_WIDTH + 150.0),
+        (-20.0, ROADS_MIDDLE + ROADS_REACH + 80.0),
     )
     infinite = rrb.TimeRangeBoundary.infinite()
     trend = rrb.TimeSeriesView(

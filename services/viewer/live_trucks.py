@@ -12,8 +12,8 @@ import rerun as rr
 
 from schemas.signals import AccelBatch, GnssFix
 from services.viewer.live_parts import TimestampedStream, extremes
-from services.viewer.rerun_file import acceleration_series
 from services.viewer.rerun_parts import MUTED, rgb, send_scalars
+from services.viewer.vehicle_signals import acceleration_series
 
 _TRACK_FIXES: Final = 300
 """Number of fixes, one per second, of a truck's track on the map."""

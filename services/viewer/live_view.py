@@ -29,6 +29,7 @@ from services.identification.comparison import (
     estimate_of_state,
     unresolved_elements,
 )
+from services.viewer.crossing_scene import CrossingScene
 from services.viewer.crossing_view import (
     CrossingView,
     ElementGeometry,
@@ -39,7 +40,6 @@ from services.viewer.crossing_view import (
     summary_line,
     view_of_crossing,
 )
-from services.viewer.layout import is_doubtful
 from services.viewer.live_clock import SampleClock
 from services.viewer.live_lanes import CrossingLanes
 from services.viewer.live_layout import (
@@ -60,7 +60,7 @@ from services.viewer.live_parts import (
     result_text,
 )
 from services.viewer.live_trucks import LiveTruck
-from services.viewer.rerun_crossing import log_rigidity
+from services.viewer.panels.rigidity import log_rigidity
 from services.viewer.rerun_parts import (
     columns_of,
     log_channel,
@@ -210,7 +210,7 @@ class LiveView:
             view = view_of_crossing(crossing, elements)
             text += f"\n\n{summary_line(view)}"
             if view.rigidity_nm2 is not None:
-                text += self._draw_result(view, moment_ns)
+                text += self._draw_result(view, view.rigidity_nm2, moment_ns)
                 self._below[crossing.bridge] = clock_text(crossing)
         if crossing.verdict == "rejected" and crossing.bridge in self._below:
             text += f"\n\nBelow: still the crossing of {self._below[crossing.bridge]}."
@@ -272,20 +272,19 @@ class LiveView:
                 entity = f"{plan_root(bridge)}/truck/{vehicle}"
                 send_places(self._recording, entity, np.column_stack((along, -left)), time_ns)
 
-    def _draw_result(self, view: CrossingView, moment_ns: int) -> str:
+    def _draw_result(self, view: CrossingView, rigidity_nm2: FloatArray, moment_ns: int) -> str:
         """Draw EI along the span with the roads below it; return sentences on the result."""
-        root = result_root(view.bridge)
-        compared = comparison_of(view, None)
+        scene = CrossingScene(view, result_root(view.bridge), comparison_of(view))
         self._recording.set_time("time", timestamp=np.datetime64(moment_ns - 1000, "ns"))
-        self._recording.log(root, rr.Clear(recursive=True))
+        self._recording.log(scene.root, rr.Clear(recursive=True))
         dated = TimestampedStream(self._recording, moment_ns)
-        log_rigidity(dated, root, view, compared, None)
-        log_roads(dated, root, view)
+        log_rigidity(dated, scene, rigidity_nm2)
+        log_roads(dated, scene.root, view)
         on_site = self._site.get(view.bridge)
-        if on_site is not None and view.rigidity_nm2 is not None:
-            ratios = view.rigidity_nm2 / view.nominal_nm2
-            self._draw_bridge(on_site.on_map, ratios, moment_ns, is_doubtful(view))
-        wording = describe_crossing(view, compared)
+        if on_site is not None:
+            ratios = rigidity_nm2 / view.nominal_nm2
+            self._draw_bridge(on_site.on_map, ratios, moment_ns, view.is_doubtful)
+        wording = describe_crossing(view, scene.compared)
         return f"\n\n{' '.join(wording)}" if wording else ""
 
     def _draw_text(self, bridge: str, moment_ns: int) -> None:

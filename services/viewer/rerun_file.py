@@ -16,18 +16,13 @@ import rerun as rr
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from schemas.signals import AccelBatch
 from services.common.files import replaced_atomically
 from services.common.progress import Steps, no_step_progress
-from services.drives.signals import series_of_batches
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.bridge_view import BridgeView, describe_bridge, origin_of
-from services.viewer.crossing_view import (
-    CrossingSpan,
-    CrossingView,
-    DetectedCrossingView,
-    FloatArray,
-)
+from services.viewer.crossing_scene import scenes_of
+from services.viewer.crossing_tab import log_crossing, when_and_where
+from services.viewer.crossing_view import CrossingSpan, CrossingView, DetectedCrossingView
 from services.viewer.drawing import STYLE, figure_bytes
 from services.viewer.drive_figure import draw_drive
 from services.viewer.layout import (
@@ -35,21 +30,10 @@ from services.viewer.layout import (
     bridge_root,
     drive_picture,
     passing_root,
-    when_and_where,
 )
-from services.viewer.rerun_crossing import (
-    WINDOW_S,
-    Channels,
-    log_acceleration,
-    log_crossing,
-    log_position,
-)
-from services.viewer.rerun_parts import (
-    IntArray,
-    log_channel,
-    log_markdown,
-    send_scalars,
-)
+from services.viewer.panels.place import log_position
+from services.viewer.panels.signals import log_accelerations
+from services.viewer.rerun_parts import log_channel, log_markdown, send_scalars
 from services.viewer.rerun_places import (
     BridgeOnMap,
     bridges_near_tracks,
@@ -59,7 +43,7 @@ from services.viewer.rerun_places import (
     log_vehicle,
     plan_root,
 )
-from services.viewer.vehicle_signals import VehicleSignals
+from services.viewer.vehicle_signals import VehicleSignals, acceleration_series
 
 APPLICATION = "driveby"
 _PIECE = 2000
@@ -100,7 +84,8 @@ def write_rrd(
     called for each crossing, and each block of accelerations.
     """
     near = bridges_near_tracks(bridges, vehicles.values())
-    default = blueprint(vehicles, crossings, overviews, passings, bridges=near, about=about)
+    scenes = scenes_of(crossings, vehicles, bridges, near, overviews)
+    default = blueprint(vehicles, scenes, overviews, passings, bridges=near, about=about)
     states = {view.bridge: view for view in overviews}
     places = {bridge.identifier: bridge for bridge in bridges}
     pieces = sum(-(-len(signals.accel) // _PIECE) for signals in vehicles.values())
@@ -123,39 +108,13 @@ def write_rrd(
                 _log_drive(recording, vehicle, signals, (*crossings, *passings))
         for view in overviews:
             _log_overview(recording, view)
-        for crossing in crossings:
-            state = states.get(crossing.bridge)
-            log_crossing(
-                recording,
-                crossing,
-                places.get(crossing.bridge),
-                vehicles.get(crossing.vehicle),
-                _series_around(crossing, vehicles.get(crossing.vehicle)),
-                None if state is None else state.baseline,
-            )
+        for scene in scenes:
+            log_crossing(recording, scene)
             drawn.one_more()
         for passing in passings:
             place = places.get(passing.bridge)
             _log_passing(recording, passing, vehicles.get(passing.vehicle), place)
         recording.flush()
-
-
-def acceleration_series(batches: Sequence[AccelBatch]) -> dict[str, tuple[IntArray, FloatArray]]:
-    """Join batches into one series per channel: wall time (ns) and acceleration (m/s²), (n,).
-
-    A NaN is inserted into every gap longer than one and a half samples: a plot then breaks its line
-    there instead of drawing values that were not measured.
-    """
-    marked = {}
-    for name, (times, samples) in series_of_batches(batches).items():
-        rates = (batch.channels[name].rate_hz for batch in batches if name in batch.channels)
-        period_ns = 1e9 / min(rates)
-        gaps = np.flatnonzero(np.diff(times) > 1.5 * period_ns) + 1
-        marked[name] = (
-            np.insert(times, gaps, times[gaps - 1] + int(period_ns / 2)),
-            np.insert(samples, gaps, np.nan),
-        )
-    return marked
 
 
 def _log_accelerations(
@@ -176,15 +135,6 @@ def _log_accelerations(
             sent = 0 if known is None else known.samples.size
             send_scalars(recording, entity, samples[sent:], time_ns=time_ns[sent:])
         drawn.one_more()
-
-
-def _series_around(passage: CrossingSpan, signals: VehicleSignals | None) -> Channels:
-    """Return the accelerations around a stay on a bridge."""
-    if signals is None:
-        return {}
-    first_ns = (passage.entry_time_s - 2.0 * WINDOW_S) * 1e9
-    last_ns = (passage.exit_time_s + WINDOW_S) * 1e9
-    return acceleration_series([b for b in signals.accel if first_ns <= b.wall_time_ns <= last_ns])
 
 
 def _recording_id(crossings: Sequence[CrossingView]) -> str:
@@ -240,9 +190,8 @@ def _log_passing(
 ) -> None:
     """Log accelerations and position of a stay that was not identified."""
     root = passing_root(passing)
-    log_acceleration(recording, root, passing, _series_around(passing, signals))
-    if signals is not None:
-        log_position(recording, root, passing, signals, place)
+    log_accelerations(recording, root, passing, signals)
+    log_position(recording, root, passing, signals, place)
 
 
 def _log_drive(

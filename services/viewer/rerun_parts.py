@@ -7,9 +7,11 @@ from typing import Any, Protocol
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from services.viewer.crossing_view import VEHICLE_COLOURS, FloatArray
+from services.viewer.strip import STRIP_PAPER
 
 TIME, CHAINAGE = "time", "chainage_mm"
 """Names of the two timelines."""
@@ -166,7 +168,61 @@ def log_labels(
     )
 
 
+def log_strips(
+    recording: RerunStream,
+    entity: str,
+    strips: Sequence[Any],
+    colours: Sequence[Rgb],
+    width: float,
+) -> None:
+    """Draw lines in a 2-D view, with a colour for all or each, `width` points to each side."""
+    lines = rr.LineStrips2D(strips, colors=colours, radii=rr.Radius.ui_points(width))
+    recording.log(entity, lines, static=True)
+
+
 def log_markdown(recording: RerunStream, entity: str, text: str) -> None:
     """Log a page of text."""
     document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
     recording.log(entity, document, static=True)
+
+
+def flat_view(
+    origin: str,
+    name: str,
+    x_range: tuple[float, float],
+    y_range: tuple[float, float],
+    contents: list[str] | None = None,
+) -> rrb.View:
+    """Return a 2-D view with limits, of an entity or of `contents`."""
+    return rrb.Spatial2DView(
+        origin=origin,
+        contents="$origin/**" if contents is None else contents,
+        name=name,
+        background=STRIP_PAPER,
+        visual_bounds=rrb.VisualBounds2D(x_range=x_range, y_range=y_range),
+    )
+
+
+def series_plot(
+    origin: str,
+    name: str,
+    only: Sequence[str] | None = None,
+    window_s: float | None = None,
+) -> rrb.View:
+    """Return a plot of a whole series, not only of its part before the cursor, or of a window."""
+    start = end = rrb.TimeRangeBoundary.infinite()
+    timelines = [TIME, CHAINAGE]
+    if window_s is not None:
+        start = rrb.TimeRangeBoundary.cursor_relative(seconds=-window_s)
+        end = rrb.TimeRangeBoundary.cursor_relative(seconds=0.0)
+        timelines = [TIME]
+    shown = [rrb.VisibleTimeRange(timeline, start=start, end=end) for timeline in timelines]
+    contents = "$origin/**" if only is None else [f"$origin/{one}" for one in only]
+    return rrb.TimeSeriesView(
+        origin=origin,
+        contents=contents,
+        name=name,
+        time_ranges=shown,
+        axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=start, end=end)),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+    )

@@ -27,6 +27,7 @@ from services.viewer.rerun_parts import (
     columns_of,
     log_labels,
     log_line,
+    log_strips,
     ratio_colours,
     rgb,
     send_scalars,
@@ -157,15 +158,8 @@ def log_surroundings(
     """Draw the bearings, scale, north and tracks on the plan of a bridge."""
     root, span = plan_root(bridge.identifier), bridge.span_m
     frame = bridge_frame(bridge)
-    recording.log(
-        f"{root}/bearings",
-        rr.LineStrips2D(
-            [[(x, -0.06 * span), (x, 0.06 * span)] for x in bridge.supports_m],
-            colors=[rgb(MUTED)],
-            radii=rr.Radius.ui_points(1.0),
-        ),
-        static=True,
-    )
+    bearings = [[(x, -0.06 * span), (x, 0.06 * span)] for x in bridge.supports_m]
+    log_strips(recording, f"{root}/bearings", bearings, [rgb(MUTED)], 1.0)
     length = _round_length(0.3 * span)
     down = 0.29 * span
     recording.log(

@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from schemas.signals import AccelBatch, GnssFix
 from schemas.topics import Message
+from services.drives.signals import series_of_batches
 from services.finding.drive import DriveMessages, drives_of
 
 _Identity = tuple[int, int]
@@ -17,6 +21,11 @@ class VehicleSignals(NamedTuple):
 
     accel: Sequence[AccelBatch]
     gnss: Sequence[GnssFix]
+
+    @property
+    def channels(self) -> frozenset[str]:
+        """Accelerometers of all batches."""
+        return frozenset(name for batch in self.accel for name in batch.channels)
 
 
 def signals_of(drives: Iterable[DriveMessages]) -> dict[str, VehicleSignals]:
@@ -42,3 +51,23 @@ def signals_of(drives: Iterable[DriveMessages]) -> dict[str, VehicleSignals]:
 def signals_of_messages(messages: Iterable[Message]) -> dict[str, VehicleSignals]:
     """Decode the sensor messages of a recording, by vehicle, in order of time."""
     return signals_of(drives_of(messages))
+
+
+def acceleration_series(
+    batches: Sequence[AccelBatch],
+) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Join batches into one series per channel: wall time (ns) and acceleration (m/s²), (n,).
+
+    A NaN is inserted into every gap longer than one and a half samples: a plot then breaks its line
+    there instead of drawing values that were not measured.
+    """
+    marked = {}
+    for name, (times, samples) in series_of_batches(batches).items():
+        rates = (batch.channels[name].rate_hz for batch in batches if name in batch.channels)
+        period_ns = 1e9 / min(rates)
+        gaps = np.flatnonzero(np.diff(times) > 1.5 * period_ns) + 1
+        marked[name] = (
+            np.insert(times, gaps, times[gaps - 1] + int(period_ns / 2)),
+            np.insert(samples, gaps, np.nan),
+        )
+    return marked

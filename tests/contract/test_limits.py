@@ -32,7 +32,6 @@ LONG_MODULES = {
     "pre_core.crossing.residuals": 742,
     "pre_core.paper.residual": 571,
     "services.logger.writer": 508,
-    "services.viewer.rerun_crossing": 490,
 }
 
 LONG_CLASSES = {

@@ -23,7 +23,7 @@ from services.recordings.recording import read_messages
 from services.recordings.writer import write_recording
 from services.report.bridge import bridge_reports
 from services.report.page import page
-from services.viewer.layout import acceleration_plots
+from services.viewer.panels.signals import acceleration_plots
 from services.viewer.recording_page import recording_page
 from tests.builders import commands
 from tests.unit.inspection.test_inspection import findings, sound

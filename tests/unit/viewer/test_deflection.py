@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from services.viewer.crossing_view import CrossingView, ParameterRow
-from services.viewer.deflection import deflection_frames
+from services.viewer.panels.deflection import deflection_frames
 
 G = 9.80665
 SPAN, RIGIDITY = 30.0, 15.6e9

@@ -13,13 +13,16 @@ from schemas.results import results_json
 from schemas.site import Site
 from schemas.site_file import load_site, site_toml
 from services.recordings.writer import write_recording
-from services.viewer import rerun_file
+from services.viewer import crossing_tab, rerun_file
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.bridge_view import origin_of, view_of_bridge, views_of_bridges
+from services.viewer.crossing_scene import Panel, crossing_root, scenes_of
+from services.viewer.crossing_tab import tab_name
 from services.viewer.crossing_view import CrossingView, view_of_crossing
 from services.viewer.drawing import STYLE
-from services.viewer.layout import blueprint, crossing_root, tab_name
-from services.viewer.rerun_crossing import verdict_markdown
+from services.viewer.layout import blueprint
+from services.viewer.panels.verdict import verdict_markdown
+from services.viewer.rerun_parts import log_markdown
 from services.viewer.rerun_places import bridges_of_site
 from services.viewer.strip import rigidity_strip
 from services.viewer.vehicle_signals import signals_of_messages
@@ -186,10 +189,36 @@ def test_every_view_has_something_to_show(tmp_path: Path, site: Site, verdict: s
     }
     views = [view_of_crossing(crossing, site.bridges[0]) for crossing in found.crossings]
     on_map = bridges_of_site(site)
-    named = list(origins(blueprint(signals, views, overviews, bridges=on_map).root_container))
+    scenes = scenes_of(views, signals, on_map, on_map, overviews)
+    named = list(origins(blueprint(signals, scenes, overviews, bridges=on_map).root_container))
     assert len(named) >= (5 if verdict == "rejected" else 8)
     for origin in named:
         assert any(path.startswith(f"/{origin}") for path in entities), origin
+
+
+@pytest.mark.parametrize("verdict", ["good", "rejected"])
+def test_panel_is_laid_out_and_drawn_where_it_has_data(
+    tmp_path: Path, site: Site, verdict: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A panel more takes its module, and its line in the columns."""
+    panel = Panel(
+        lambda scene: scene.crossing.rigidity_nm2,
+        lambda scene, _: rrb.TextDocumentView(origin=f"{scene.root}/lowest"),
+        lambda to, scene, ei: log_markdown(to, f"{scene.root}/lowest", f"{ei.min():.3g} N·m²"),
+    )
+    first, *others = crossing_tab._COLUMNS
+    monkeypatch.setattr(
+        crossing_tab, "_COLUMNS", (first, *others, others[-1]._replace(panels=(panel,)))
+    )
+    reasons = () if verdict == "good" else ("position_outage",)
+    found = results_of(site, some_crossing("a", verdict=verdict, reasons=reasons))
+    views = [view_of_crossing(crossing, site.bridges[0]) for crossing in found.crossings]
+    write_views(tmp_path / "a.rrd", vehicles={}, crossings=found.crossings, site=site)
+    drawn = {chunk.entity_path for chunk in RrdReader(tmp_path / "a.rrd").stream().to_chunks()}
+    scenes = scenes_of(views, {}, [], [], [])
+    named = set(origins(blueprint({}, scenes).root_container))
+    entity = f"{crossing_root(views[0])}/lowest"
+    assert (entity in named) == (f"/{entity}" in drawn) == (verdict == "good")
 
 
 def origins(part: rrb.Container | rrb.View) -> Iterator[str]:

@@ -24,8 +24,8 @@ from services.viewer.crossing_view import comparison_of, view_of_crossing
 from services.viewer.crossings_figure import draw_crossings
 from services.viewer.drawing import STYLE
 from services.viewer.figure import draw_crossing
+from services.viewer.panels.verdict import verdict_markdown
 from services.viewer.pictures import write_pictures
-from services.viewer.rerun_crossing import verdict_markdown
 from services.viewer.rerun_parts import MUTED, ratio_colours, rgb
 from tests.unit.viewer.found import results_of, some_crossing
 from tests.unit.words import assert_words_apart, words

@@ -4,7 +4,7 @@ import pytest
 
 from schemas.results import Prior
 from services.viewer.crossing_view import ParameterRow
-from services.viewer.prior_posterior import prior_posterior_rows
+from services.viewer.panels.learned import prior_posterior_rows
 
 
 def row(name: str, low: float, mean: float, high: float, prior: Prior | None) -> ParameterRow:

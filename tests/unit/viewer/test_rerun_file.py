@@ -28,14 +28,18 @@ from services.cli import main as cli
 from services.common.errors import InputError
 from services.recordings.writer import write_recording
 from services.viewer import rerun_file
-from services.viewer.crossing_view import CrossingView, view_of_crossing
-from services.viewer.layout import blueprint, crossing_root
-from services.viewer.rerun_crossing import front_axle_chainage, verdict_markdown
-from services.viewer.rerun_file import acceleration_series
+from services.viewer.crossing_scene import CrossingScene, crossing_root
+from services.viewer.crossing_view import CrossingView, front_axle_chainage, view_of_crossing
+from services.viewer.layout import blueprint
+from services.viewer.panels.verdict import verdict_markdown
 from services.viewer.rerun_parts import CHAINAGE
 from services.viewer.rerun_places import bridges_near_tracks, bridges_of_site
 from services.viewer.strip import STRIP_HEIGHT, STRIP_WIDTH, rigidity_strip
-from services.viewer.vehicle_signals import VehicleSignals, signals_of_messages
+from services.viewer.vehicle_signals import (
+    VehicleSignals,
+    acceleration_series,
+    signals_of_messages,
+)
 from services.viewer.view import (
     convert,
     view_command,
@@ -251,7 +255,8 @@ def test_whole_drive_is_a_picture_over_its_own_time(drive):
 
 def test_play_drives_at_the_speed_of_the_truck_and_on_the_bridge(site: Site) -> None:
     view = view_of_crossing(crossing(), site.bridges[0])
-    panel = blueprint({}, [view]).time_panel
+    scene = CrossingScene(view, crossing_root(view), None)
+    panel = blueprint({}, [scene]).time_panel
     assert panel.timeline == CHAINAGE
     assert panel.play_state == "playing"
     assert panel.fps == pytest.approx(1e3 * view.speed_m_per_s)

@@ -13,7 +13,7 @@ from schemas.results import Results
 from schemas.settings import IdentificationSettings
 from services.execution.offline import identify_recordings, site_of
 from services.recordings.recording import read_messages
-from services.viewer.rerun_residuals import band_names
+from services.viewer.panels.residuals import band_names
 from services.viewer.residuals import _by_band, residual_cells
 from services.viewer.view import write_views
 

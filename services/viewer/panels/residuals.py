@@ -5,15 +5,17 @@ Coordinates are in units of a bin: bands from left to right, segments from top t
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from services.viewer.crossing_view import CrossingView, FloatArray, ResidualCells
-from services.viewer.rerun_parts import RerunStream, log_labels
+from services.viewer.crossing_scene import CrossingScene, Panel
+from services.viewer.crossing_view import FloatArray, ResidualCells
+from services.viewer.rerun_parts import RerunStream, flat_view, log_labels
 
-RESIDUALS_BOUNDS = ((-2.8, 4.2), (-1.3, 10.7))
-"""Limits of the view in x and y."""
 _KINDS = ("roads", "front body", "rear body")
 _STRETCHES = ("before", "on", "behind")
 _PIXELS = 40
@@ -25,11 +27,13 @@ _GAP = 0.3
 """Gap between the kinds."""
 
 
-def log_residuals(recording: RerunStream, root: str, crossing: CrossingView) -> None:
-    """Draw the mean square of each bin over the declared noise power, if it is known."""
-    if crossing.residuals is None:
-        return
-    cells, entity = crossing.residuals, f"{root}/residuals"
+def _layout(scene: CrossingScene, _: ResidualCells) -> rrb.View:
+    return flat_view(f"{scene.root}/residuals", "Residuals", (-2.8, 4.2), (-1.3, 10.7))
+
+
+def _log(recording: RerunStream, scene: CrossingScene, cells: ResidualCells) -> None:
+    """Draw the mean square of each bin over the declared noise power."""
+    crossing, entity = scene.crossing, f"{scene.root}/residuals"
     kinds, stretches, bands = cells.mean_square.shape
     shades = _shades(cells)
     across: FloatArray = np.arange(bands, dtype=np.float64) + 0.5
@@ -76,3 +80,6 @@ def _shades(cells: ResidualCells) -> NDArray[np.uint8]:
     mixed[~np.isfinite(cells.mean_square)] = _NOTHING
     shades: NDArray[np.uint8] = np.rint(mixed).astype(np.uint8)
     return shades
+
+
+PANEL: Final = Panel(lambda scene: scene.crossing.residuals, _layout, _log)

@@ -1,0 +1,1 @@
+"""Panels of a crossing in Rerun: a module each, with its layout and its drawing."""
