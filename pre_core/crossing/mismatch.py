@@ -153,6 +153,11 @@ def expected_levels(front: Footprint, rear: Footprint, road_class: str) -> Float
     return density * np.array([spectra(single, other, at)[3][0] for other in (unlike, beside)])
 
 
+def has_equal_tyres(front: Footprint, rear: Footprint) -> bool:
+    """Return whether the axles differ by a lateral offset at most."""
+    return front._replace(offset_m=0.0) == rear._replace(offset_m=0.0)
+
+
 def _above_zero() -> FloatArray:
     """Return the grid without its zero, where the spectrum of an offset has no limit."""
     points = round(_MAX_CYCLES_PER_M / _GRID_CYCLES_PER_M) + 1
@@ -167,7 +172,7 @@ def _pairs(front: Footprint, rear: Footprint) -> tuple[tuple[Footprint, Footprin
     Equal tyres are replaced by worn ones, because real ones are never exactly equal.
     """
     single, unlike = front._replace(offset_m=0.0), rear._replace(offset_m=0.0)
-    if unlike == single:
+    if has_equal_tyres(front, rear):
         unlike = single._replace(width_m=_WORN * single.width_m)
     return (single, unlike), (single, single._replace(offset_m=_OFFSET_M))
 
