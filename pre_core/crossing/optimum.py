@@ -355,34 +355,27 @@ def _find_truck(
 ) -> tuple[PosteriorProblem, FloatArray, int]:
     """Return the first stage's problem, coordinates and evaluations, the bridge as a whole.
 
-    Where a wrong truck makes alike profiles differ, the truck comes before the mismatch: a mismatch
-    estimated with a wrong truck would be followed by trucks that respond ever less to it.
+    Alike profiles (tandem, equal tyres) differ less than a wrong truck makes them differ, so
+    that their truck comes before the mismatch. Otherwise it would follow a mismatch of its own
+    making, to tyres that are ever softer.
     """
     whole = _whole_bridge(problem, strategy)
-    is_truck_first = strategy.differs and _has_alike_profiles(problem)
+    is_alike = has_tandem(problem) or has_equal_tyres(*problem.mismatch.shapes.footprints)
 
     def with_force(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
         return update_noise(problem, y, force)
 
     evaluations = 0
-    if strategy.differs and not is_truck_first:
+    if strategy.differs and not is_alike:
         problem = update_noise(problem, y, force, mismatch=levels_at(problem, y))
     for temperature, steps in _COARSE_WITH_MISMATCH if strategy.differs else _COARSE:
         report("finding the truck", 0.05)
         problem, y, _, used = fit_stage(problem, y, whole, (temperature, steps, 0.5), with_force)
         evaluations += used
         problem = update_noise(problem, y, force)
-    if is_truck_first:
+    if strategy.differs and is_alike:
         problem = update_noise(problem, y, force, mismatch=levels_at(problem, y))
     return problem, y, evaluations
-
-
-def _has_alike_profiles(problem: PosteriorProblem) -> bool:
-    """Return whether the compared axles' profiles differ less than a wrong truck makes them differ.
-
-    They do under a tandem and under tyres that are declared equal.
-    """
-    return has_tandem(problem) or has_equal_tyres(*problem.mismatch.shapes.footprints)
 
 
 def _with_free_ends(found: Optimum, strategy: SearchStrategy) -> tuple[Optimum, int]:
