@@ -22,8 +22,13 @@ from schemas.results_on_the_wire import estimate_to_crossing, state_to_bridge
 from schemas.signals import decode_accel, decode_gnss
 from services.bus.realm_listener import BusMessage
 from services.common.errors import one_line
-from services.identification.comparison import Estimate, compare, estimate_of_state
-from services.viewer.crossing_view import ResultElements, elements_of_result, view_of_crossing
+from services.identification.comparison import Comparison, compare, estimate_of_state
+from services.viewer.crossing_view import (
+    ResultElements,
+    comparison_of,
+    elements_of_result,
+    view_of_crossing,
+)
 
 _RATE_S: Final = 5.0
 """Duration in s over which rates are computed."""
@@ -230,8 +235,7 @@ class RealmModel:
             ]
             ratios = tuple(one.ratio for one in over)
             edges_m = np.concatenate(([0.0], np.cumsum(elements.lengths_m)))
-            compared = compare(estimate_of_state(state), np.array(nominal), edges_m)
-            weak = frozenset(one.number for one in (compared.weak if compared else ()))
+            weak = _weak(compare(estimate_of_state(state), np.array(nominal), edges_m))
             lowest = str(min(over, key=lambda one: one.ratio))
         if bridge not in self.bridges and len(self.bridges) >= _MAX_BRIDGES:
             self.bridges.pop(next(iter(self.bridges)))
@@ -309,10 +313,9 @@ def _with_elements(
     if view.rigidity_nm2 is None or view.interval_nm2 is None:
         return row
     ratios = tuple((view.rigidity_nm2 / view.nominal_nm2).tolist())
-    weak: frozenset[int] = frozenset()
-    if view.verdict == "good" and view.interval_has_meaning:
-        low, high = np.asarray(view.interval_nm2).T
-        found = Estimate(view.rigidity_nm2, low, high, view.scale_error)
-        compared = compare(found, view.nominal_nm2, view.element_edges_m)
-        weak = frozenset(one.number for one in (compared.weak if compared else ()))
-    return row._replace(ratios=ratios, weak=weak)
+    compared = comparison_of(view) if view.verdict == "good" else None
+    return row._replace(ratios=ratios, weak=_weak(compared))
+
+
+def _weak(compared: Comparison | None) -> frozenset[int]:
+    return frozenset(one.number for one in (compared.weak if compared else ()))
