@@ -14,6 +14,7 @@ finder: the identification gets what it would get from a recording.
 """
 
 import time
+from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -23,7 +24,7 @@ from pre_core import parameters
 from pre_core.physics.bridge import Beam, natural_frequencies_hz
 from pre_core.physics.models import from_models
 from pre_core.physics.road import Profile
-from pre_core.physics.sensors import Accelerometer, ReceiverModel
+from pre_core.physics.sensors import Accelerometer
 from pre_core.physics.simulate import Motion
 from pre_core.physics.vehicle import HalfCar
 from schemas.reasons import Reason
@@ -41,6 +42,7 @@ from services.simulation.drive import (
     SETTLE_S,
     TRUCK_KEYS,
     DepartedVehicle,
+    DrivenRoad,
     beam_of,
     declared_site,
     half_car,
@@ -50,7 +52,7 @@ from services.simulation.drive import (
 )
 from services.simulation.drive_wide import LONGEST_STEP_S as LONGEST_WIDE_STEP_S
 from services.simulation.drive_wide import Width, measured_wide_run
-from services.simulation.positions import SLOW_ERROR_S
+from services.simulation.positions import Instruments, TimedMotion, receiver_of
 from services.simulation.wheel_paths import WheelPaths
 
 Floats = NDArray[np.float64]
@@ -112,6 +114,13 @@ class DriveConditions(NamedTuple):
     noise_ug_per_rthz: float
     body_noise_ug_per_rthz: float | None = None
     """Noise of the two body sensors, if they are of another kind than those of the axles."""
+
+    @property
+    def densities_ug_per_rthz(self) -> tuple[float, float, float, float]:
+        """Noise of the four channels."""
+        axles, body = self.noise_ug_per_rthz, self.body_noise_ug_per_rthz
+        body = axles if body is None else body
+        return body, body, axles, axles
 
 
 class ChannelErrors(NamedTuple):
@@ -272,50 +281,23 @@ def drive(
 
     The noise is that of the conditions, unless that of each channel is given.
     """
-    vehicle, bridge, how = with_two_axles(site.vehicles[0]), site.bridges[0], truth.conditions
+    bridge, how = site.bridges[0], truth.conditions
     longest_s = LONGEST_STEP_S if truth.width is None else LONGEST_WIDE_STEP_S
     every = max(1, int(np.ceil(1.0 / (how.rate_hz * longest_s))))
     step_s = 1.0 / (how.rate_hz * every)
     settling = round(SETTLE_S * how.rate_hz) * every
-    errors = truth.channels
-    axles = how.noise_ug_per_rthz
-    body = axles if how.body_noise_ug_per_rthz is None else how.body_noise_ug_per_rthz
-    densities = noise_ug_per_rthz or (body, body, axles, axles)
-    sensors = [
-        Accelerometer(
-            how.rate_hz,
-            noise_density_ug_per_rthz=densities[c],
-            bias_m_per_s2=float(errors.bias_m_per_s2[c]),
-            gain_error=float((1.0 + errors.common_gain) * (1.0 + errors.gain[c]) - 1.0),
-            delay_s=float(errors.delay_s[c]),
-        )
-        for c in range(4)
-    ]
-    receiver = ReceiverModel(
-        how.fix_rate_hz,
-        position_noise_m=site.receiver.position_noise_m,
-        position_spread_m=site.receiver.position_spread_m,
-        correlation_s=SLOW_ERROR_S,
-        speed_noise_m_per_s=site.receiver.speed_noise_m_per_s,
-        latency_s=truth.latency_s,
-    )
-    rng = np.random.default_rng(np.random.SeedSequence([seed, 0x6E]))
+    densities = noise_ug_per_rthz or how.densities_ug_per_rthz
+    instruments = _instruments(site, truth, densities, seed)
     if truth.width is not None:
-        half_s = 0.5 * step_s
-        halves = _motion(truth, bridge, half_s, 2 * every)
+        halves = _motion(truth, bridge, 0.5 * step_s, 2 * every)
         wide = measured_wide_run(
             bridge,
             truth.car,
             truth.beam,
             truth.width,
-            halves,
-            half_s,
-            settling,
+            TimedMotion(halves, step_s, settling),
             (how.road_class, how.road_seed),
-            sensors,
-            receiver,
-            rng,
-            antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
+            instruments,
         )
         of_channels = np.array(densities) / (np.sqrt(2.0) if truth.width.sensors else 1.0)
         return SimulatedCrossing(
@@ -333,16 +315,10 @@ def drive(
         bridge,
         truth.car,
         truth.beam,
-        motion,
-        step_s,
-        settling,
-        (how.road_class, how.road_seed),
-        sensors,
-        receiver,
-        rng,
-        antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
-        left=truth.left,
-        paths=truth.paths,
+        TimedMotion(motion, step_s, settling),
+        DrivenRoad(how.road_class, how.road_seed, truth.paths),
+        instruments,
+        truth.left,
     )
     return SimulatedCrossing(
         truth,
@@ -354,6 +330,28 @@ def drive(
         roads.front,
         float(-happened.wheel_deflection_m.min()),
     )
+
+
+def _instruments(
+    site: Site, truth: CrossingTruth, densities: Sequence[float], seed: int
+) -> Instruments:
+    """Return the accelerometers of the four channels and the receiver, with their errors."""
+    errors, vehicle = truth.channels, with_two_axles(site.vehicles[0])
+    sensors = [
+        Accelerometer(
+            truth.conditions.rate_hz,
+            noise_density_ug_per_rthz=densities[c],
+            bias_m_per_s2=float(errors.bias_m_per_s2[c]),
+            gain_error=float((1.0 + errors.common_gain) * (1.0 + errors.gain[c]) - 1.0),
+            delay_s=float(errors.delay_s[c]),
+        )
+        for c in range(4)
+    ]
+    receiver = receiver_of(site, perfect=False)._replace(
+        rate_hz=truth.conditions.fix_rate_hz, latency_s=truth.latency_s
+    )
+    rng = np.random.default_rng(np.random.SeedSequence([seed, 0x6E]))
+    return Instruments(sensors, receiver, rng, vehicle.gps_antenna_to_front_axle_m)
 
 
 def _motion(truth: CrossingTruth, bridge: Bridge, step_s: float, every: int) -> Motion:

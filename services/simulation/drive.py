@@ -25,12 +25,8 @@ from pre_core.physics.bridge import (
 )
 from pre_core.physics.free_vibration import free_vibration_after
 from pre_core.physics.road import Profile, contact_patch_average, iso_8608_profile, under_axles
-from pre_core.physics.sensors import (
-    Accelerometer,
-    ReceiverModel,
-    measure_acceleration,
-)
-from pre_core.physics.simulate import CoupledResponse, Motion, constant_acceleration, simulate
+from pre_core.physics.sensors import Accelerometer, measure_acceleration
+from pre_core.physics.simulate import CoupledResponse, constant_acceleration, simulate
 from pre_core.physics.vehicle import HalfCar, static_axle_loads_n
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle
@@ -40,7 +36,13 @@ from services.drives.runs import Run, run_to_messages
 from services.recordings.writer import write_recording
 from services.simulation.lane import Twist
 from services.simulation.positions import START_TIME_S as START_TIME_S
-from services.simulation.positions import gnss_track, receiver_of
+from services.simulation.positions import (
+    AntennaTrack,
+    Instruments,
+    TimedMotion,
+    gnss_track,
+    receiver_of,
+)
 from services.simulation.schedule import Schedule, begun_at
 from services.simulation.wheel_paths import (
     AxleRoads,
@@ -92,6 +94,18 @@ class OutOfModelEffects(NamedTuple):
 
 
 NO_EFFECTS = OutOfModelEffects()
+
+
+class DrivenRoad(NamedTuple):
+    """The road under a simulated truck."""
+
+    kind: str | Profile
+    """ISO 8608 class, or the profile of both axles."""
+    seed: int
+    """Seed of the phases of a class."""
+    paths: WheelPaths | None = None
+    """Paths of the wheels on a surface of the class; None: one profile for both axles."""
+    lane_offset_m: float = 0.0
 
 
 class SimulatedDrive(NamedTuple):
@@ -197,17 +211,15 @@ def simulate_drive(
         bridge,
         car,
         beam,
-        motion,
-        step_s,
-        settle,
-        (road_class, seed),
-        (sensor,) * len(CHANNELS),
-        receiver_of(site, perfect=not receiver_errors),
-        np.random.default_rng(seed if drive_seed is None else drive_seed),
-        antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
-        left=beyond.left,
-        paths=paths,
-        lane_offset_m=beyond.twist.lane_offset_m if beyond.twist else 0.0,
+        TimedMotion(motion, step_s, settle),
+        DrivenRoad(road_class, seed, paths, beyond.twist.lane_offset_m if beyond.twist else 0.0),
+        Instruments(
+            (sensor,) * len(CHANNELS),
+            receiver_of(site, perfect=not receiver_errors),
+            np.random.default_rng(seed if drive_seed is None else drive_seed),
+            vehicle.gps_antenna_to_front_axle_m,
+        ),
+        beyond.left,
     )[:2]
     ratios = np.asarray(rigidity_ratios, dtype=np.float64)
     return SimulatedDrive(run, roads.front, ratios, None if paths is None else roads.rear)
@@ -217,39 +229,30 @@ def measured_run(
     bridge: Bridge,
     car: HalfCar,
     beam: Beam,
-    motion: Motion,
-    step_s: float,
-    settling_steps: int,
-    road: tuple[str | Profile, int],
-    sensors: Sequence[Accelerometer],
-    receiver: ReceiverModel,
-    rng: np.random.Generator,
-    *,
-    antenna_to_front_axle_m: float = 0.0,
+    driven: TimedMotion,
+    road: DrivenRoad,
+    instruments: Instruments,
     left: DepartedVehicle | None = None,
-    paths: WheelPaths | None = None,
-    lane_offset_m: float = 0.0,
 ) -> tuple[Run, AxleRoads, CoupledResponse]:
-    """Drive `car` over `beam` along `motion` and measure it with one sensor per channel.
+    """Drive `car` over `beam` along a motion and measure it with one sensor per channel.
 
-    `road` is an ISO 8608 class and the seed of its phases: of one profile for both axles, or of a
-    surface where the wheels follow `paths`; or a profile, and a seed without effect. The recording
-    begins after `settling_steps`; the sensors have one rate, of which the steps are a whole
-    fraction. After a vehicle has `left` the bridge, it vibrates when the first wheel enters. Return
-    the recording, the road under the tyres and the response of truck and bridge. Raise FailureError
-    if the coupled simulation does not converge.
+    After a vehicle has `left` the bridge, it vibrates when the first wheel enters. Return the
+    recording, the road under the tyres and the response of truck and bridge. Raise FailureError if
+    the coupled simulation does not converge.
     """
-    accel_rng, gnss_rng, place_rng = rng.spawn(3)
+    motion, step_s, settling_steps = driven
+    sensors = instruments.sensors
+    accel_rng, gnss_rng, place_rng = instruments.rng.spawn(3)
     sign = 1 if motion.speed_m_per_s[0] >= 0.0 else -1
     reach = car.wheelbase_m + 1.0
-    if paths is None:
+    if road.paths is None:
         low, high = motion.position_m.min() - reach, motion.position_m.max() + reach
-        groove = contact_patch_average(_profile(low, high, *road), _CONTACT_PATCH_M)
+        groove = contact_patch_average(_profile(low, high, road.kind, road.seed), _CONTACT_PATCH_M)
         roads = AxleRoads(groove, groove)
     else:
-        assert isinstance(road[0], str)  # noqa: S101 - a profile has no width
-        of_class = (road[0], road[1])
-        roads = roads_of_surface(bridge, motion, reach, _ROAD_SPACING_M, of_class, paths, place_rng)
+        assert isinstance(road.kind, str)  # noqa: S101 - a profile has no width
+        of_class, spacing_m = (road.kind, road.seed), _ROAD_SPACING_M
+        roads = roads_of_surface(bridge, motion, reach, spacing_m, of_class, road.paths, place_rng)
     felt = under_axles(*roads, motion, car.wheelbase_m, sign)
     mesh = refine(beam, _PARTS)
     count = min(_MODES * (1 + len(mesh.interior_supports)), _freedoms(mesh))
@@ -264,10 +267,10 @@ def measured_run(
         for i, name in enumerate(CHANNELS)
     }
     time_s = START_TIME_S + np.arange(channels[CHANNELS[0]].size) / rate
-    antenna = motion.position_m[settling_steps:] - sign * antenna_to_front_axle_m
+    chainage_m = motion.position_m[settling_steps:] - sign * instruments.antenna_to_front_axle_m
     speed = np.abs(motion.speed_m_per_s[settling_steps:])
-    lateral = np.full_like(antenna, lane_offset_m)
-    gnss = gnss_track(bridge, step_s, antenna, lateral, speed, receiver, gnss_rng, forward=sign > 0)
+    antenna = AntennaTrack(chainage_m, np.full_like(chainage_m, road.lane_offset_m), speed)
+    gnss = gnss_track(bridge, step_s, antenna, instruments.receiver, gnss_rng, forward=sign > 0)
     return Run("simulation", time_s, rate, channels, gnss), roads, fine
 
 

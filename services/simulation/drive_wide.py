@@ -12,14 +12,19 @@ from numpy.typing import NDArray
 
 from pre_core.physics.bridge import Beam
 from pre_core.physics.road import Profile
-from pre_core.physics.sensors import Accelerometer, ReceiverModel, measure_acceleration
-from pre_core.physics.simulate import Motion as PlaneMotion
+from pre_core.physics.sensors import Accelerometer, measure_acceleration
 from pre_core.physics.surface import Footprint
 from pre_core.physics.vehicle import HalfCar
 from schemas.signals import CHANNELS
 from schemas.site import Bridge
 from services.drives.runs import Run
-from services.simulation.positions import START_TIME_S, gnss_track
+from services.simulation.positions import (
+    START_TIME_S,
+    AntennaTrack,
+    Instruments,
+    TimedMotion,
+    gnss_track,
+)
 from services.simulation.two_sided import Body, WideAxle, WideMotion, WideRoad, WideTruck, cross
 from services.simulation.two_sided_deck import Deck, Torsion
 from services.simulation.two_sided_surface import draw_waves
@@ -63,23 +68,17 @@ def measured_wide_run(
     car: HalfCar,
     beam: Beam,
     width: Width,
-    motion: PlaneMotion,
-    half_step_s: float,
-    settling_steps: int,
+    driven: TimedMotion,
     road: tuple[str, int],
-    sensors: Sequence[Accelerometer],
-    receiver: ReceiverModel,
-    rng: np.random.Generator,
-    *,
-    antenna_to_front_axle_m: float = 0.0,
+    instruments: Instruments,
 ) -> WideDrive:
-    """Drive a truck with width along `motion` (every half step) and measure it.
+    """Drive a truck with width along a motion, given every half step, and measure it.
 
-    `sensors` are those of the four channels; further sensors of the truck have the rate of the
-    first one, the density of their channel's kind, and errors of their own. The recording begins
-    after `settling_steps` whole steps.
+    The sensors are those of the four channels; further sensors of the truck have the rate of the
+    first one, the density of their channel's kind, and errors of their own.
     """
-    accel_rng, gnss_rng, place_rng = rng.spawn(3)
+    motion, step_s, settling_steps = driven
+    accel_rng, gnss_rng, place_rng = instruments.rng.spawn(3)
     truck, deck = truck_with_width(car, width), deck_with_width(beam, width)
     forward = bool(motion.speed_m_per_s[0] >= 0.0)
     lane = width.lane_offset_m + width.paths.wander_m * float(place_rng.standard_normal())
@@ -93,7 +92,6 @@ def measured_wide_run(
         forward=forward,
     )
     count = motion.position_m.size - (motion.position_m.size + 1) % 2
-    step_s = 2.0 * half_step_s
     response = cross(
         truck,
         deck,
@@ -103,28 +101,26 @@ def measured_wide_run(
         settle_s=_SETTLE_S,
     )
     recorded = response.acceleration[settling_steps:]
-    rate = sensors[0].rate_hz
     read = {
         place.channel: measure_acceleration(
             recorded @ sensor_row(truck, place), 1.0 / step_s, sensor, accel_rng
         )
-        for place, sensor in _places(car, width, sensors)
+        for place, sensor in _places(car, width, instruments.sensors)
     }
     channels = middle_channels(read, width.sensors) if width.sensors else read
     position = motion.position_m[:count:2][settling_steps:]
     speed = np.abs(motion.speed_m_per_s[:count:2][settling_steps:])
+    to_front_axle_m = (1 if forward else -1) * instruments.antenna_to_front_axle_m
     gnss = gnss_track(
         bridge,
         step_s,
-        position - (1 if forward else -1) * antenna_to_front_axle_m,
-        np.full_like(position, lane),
-        speed,
-        receiver,
+        AntennaTrack(position - to_front_axle_m, np.full_like(position, lane), speed),
+        instruments.receiver,
         gnss_rng,
         forward=forward,
     )
-    samples = channels[CHANNELS[0]].size
-    time_s = START_TIME_S + np.arange(samples, dtype=np.float64) / rate
+    rate = instruments.sensors[0].rate_hz
+    time_s = START_TIME_S + np.arange(channels[CHANNELS[0]].size, dtype=np.float64) / rate
     run = Run("simulation", time_s, rate, channels, gnss)
     return WideDrive(run, _felt_in_front(surface, truck), -float(response.deflection_m.min()))
 

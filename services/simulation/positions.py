@@ -1,9 +1,13 @@
 """Fixes of a simulated truck's receiver."""
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.physics.sensors import ReceiverModel, measure_position
+from pre_core.physics.sensors import Accelerometer, ReceiverModel, measure_position
+from pre_core.physics.simulate import Motion
 from schemas.site import Bridge, Site
 from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
 from services.drives.runs import GnssTrack
@@ -17,6 +21,35 @@ SLOW_ERROR_S = 300.0
 """Correlation time of the slow error, some minutes: it is almost constant in a crossing."""
 _ALTITUDE_M = 25.0
 """Altitude of a bridge without one in the site file."""
+
+
+class TimedMotion(NamedTuple):
+    """The motion of a simulated truck."""
+
+    motion: Motion
+    step_s: float
+    """Length of a simulated step, a whole fraction of the sensors' sampling interval."""
+    settling_steps: int
+    """Number of steps before the recording."""
+
+
+class Instruments(NamedTuple):
+    """Sensors of a simulated truck."""
+
+    sensors: Sequence[Accelerometer]
+    """One for each channel, all of one rate."""
+    receiver: ReceiverModel
+    rng: np.random.Generator
+    """Source of their noise, and of the truck's lateral position."""
+    antenna_to_front_axle_m: float = 0.0
+
+
+class AntennaTrack(NamedTuple):
+    """Motion of the receiver's antenna, (n,) by step."""
+
+    chainage_m: Floats
+    lateral_m: Floats
+    speed_m_per_s: Floats
 
 
 def receiver_of(site: Site, *, perfect: bool) -> ReceiverModel:
@@ -44,17 +77,15 @@ def _altitude_m(bridge: Bridge, chainage_m: Floats) -> Floats:
 def gnss_track(
     bridge: Bridge,
     step_s: float,
-    antenna: Floats,
-    lateral: Floats,
-    speed: Floats,
+    antenna: AntennaTrack,
     receiver: ReceiverModel,
     rng: np.random.Generator,
     *,
     forward: bool,
 ) -> GnssTrack:
-    """Return the fixes on a drive of the receiver's antenna, positions (n,) by step."""
-    time_s = step_s * np.arange(antenna.size, dtype=np.float64)
-    fixes = measure_position(time_s, antenna, lateral, speed, receiver, rng)
+    """Return the fixes on a drive of the receiver's antenna."""
+    time_s = step_s * np.arange(antenna.chainage_m.size, dtype=np.float64)
+    fixes = measure_position(time_s, *antenna, receiver, rng)
     frame = bridge_frame(bridge)
     latitude, longitude = to_lat_lon(frame, fixes.chainage_m, fixes.lateral_m)
     return GnssTrack(

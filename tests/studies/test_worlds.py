@@ -191,9 +191,9 @@ def test_the_surface_is_driven_over_by_the_worlds_truck(monkeypatch: pytest.Monk
     reported: list[object] = []
     real = drawn_crossings.measured_run
 
-    def keeping(*arguments: Any, **named: Any) -> Any:
-        reported.append(named["paths"])
-        return real(*arguments, **named)
+    def keeping(*arguments: Any) -> Any:
+        reported.append(arguments[4].paths)
+        return real(*arguments)
 
     monkeypatch.setattr(drawn_crossings, "measured_run", keeping)
     monkeypatch.setattr(validation, "identify_simulated", lambda runs, site, settings: [])
