@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.settings import IdentificationSettings
@@ -32,6 +33,8 @@ from services.identification.names import Names
 from services.identification.outputs import IdentificationTask, Output, crossing_output
 from services.identification.waiting import FromRecording, pending_of
 from services.recordings.recording import is_being_written, read_messages
+
+Ints = NDArray[np.int64]
 
 AROUND_NS: Final = 60 * NS_PER_S
 """Time read before and after a crossing, for the sense of travel and for late messages."""
@@ -75,10 +78,7 @@ def scan_stays(files: Sequence[Path], realm: str, vehicle: str, site: Site) -> S
     The files follow each other; a message in two of them counts once. A file that is being written
     is read up to its end; what is unreadable is a warning.
     """
-    boots: dict[int, dict[int, int]] = {}
-    """Row number by boot and sequence number."""
-    rows = array("d")
-    walls, received = array("q"), array("q")
+    positions = _Positions()
     ranges: dict[Path, tuple[int, int]] = {}
     warnings: list[str] = []
     for path in files:
@@ -88,39 +88,11 @@ def scan_stays(files: Sequence[Path], realm: str, vehicle: str, site: Site) -> S
             time_ns = message.log_time_ns
             first_ns, last_ns = ranges.get(path, (time_ns, time_ns))
             ranges[path] = min(first_ns, time_ns), max(last_ns, time_ns)
-            known = boots.setdefault(message.boot_id, {})
-            if message.key.stream != "gnss" or message.sequence in known:
-                continue
-            try:
-                fix = decode_gnss(message.payload)
-            except ValueError:
-                continue
-            known[message.sequence] = len(walls)
-            walls.append(fix.wall_time_ns)
-            received.append(message.publish_time_ns)
-            rows.extend(
-                (
-                    fix.device_time_ns / NS_PER_S,
-                    fix.latitude_deg,
-                    fix.longitude_deg,
-                    fix.speed_m_per_s,
-                    fix.altitude_m,
-                )
-            )
-    table = np.array(rows).reshape(-1, len(Fixes._fields))
+            positions.add(message)
     car: AxleGeometry = {v.id: v for v in site.vehicles}.get(vehicle) or UnlistedVehicle()
     bridges = Bridges(site.bridges, site.receiver)
     found: list[RecordedStay] = []
-    for boot_id, numbers in boots.items():
-        order = np.array([numbers[sequence] for sequence in sorted(numbers)], dtype=np.int64)
-        if order.size < 2:
-            continue
-        columns = table[order].T
-        # The order of the worker (`Boot.fixes`): by time, each time once.
-        by_time = np.lexsort(columns[::-1])
-        by_time = by_time[np.diff(columns[0][by_time], prepend=-np.inf) > 0.0]
-        fixes = Fixes(*np.ascontiguousarray(columns[:, by_time]))
-        wall_ns, came_ns = np.array(walls)[order][by_time], np.array(received)[order][by_time]
+    for boot_id, fixes, wall_ns, came_ns in positions.by_boot():
         for number, stay in bridges.all_stays(car, fixes):
             at = int(np.searchsorted(fixes.time_s, stay.entry_s, side="right")) - 1
             last = min(int(np.searchsorted(fixes.time_s, stay.exit_s)), fixes.time_s.size - 1)
@@ -138,6 +110,48 @@ def scan_stays(files: Sequence[Path], realm: str, vehicle: str, site: Site) -> S
                 )
             )
     return StayScan(tuple(found), ranges, tuple(warnings))
+
+
+class _Positions:
+    """Positions of a truck, each once."""
+
+    def __init__(self) -> None:
+        self._boots: dict[int, dict[int, int]] = {}
+        """Row number by boot and sequence number."""
+        self._rows = array("d")
+        self._walls, self._received = array("q"), array("q")
+
+    def add(self, message: Message) -> None:
+        known = self._boots.setdefault(message.boot_id, {})
+        if message.key.stream != "gnss" or message.sequence in known:
+            return
+        try:
+            fix = decode_gnss(message.payload)
+        except ValueError:
+            return
+        known[message.sequence] = len(self._walls)
+        self._walls.append(fix.wall_time_ns)
+        self._received.append(message.publish_time_ns)
+        time_s = fix.device_time_ns / NS_PER_S
+        place = fix.latitude_deg, fix.longitude_deg
+        self._rows.extend((time_s, *place, fix.speed_m_per_s, fix.altitude_m))
+
+    def by_boot(self) -> Iterator[tuple[int, Fixes, Ints, Ints]]:
+        """Yield each boot with its fixes, and with their wall times and times of reception in ns.
+
+        They are in the order of the worker (`Boot.fixes`): by time, each time once.
+        """
+        table = np.array(self._rows).reshape(-1, len(Fixes._fields))
+        for boot_id, numbers in self._boots.items():
+            order = np.array([numbers[sequence] for sequence in sorted(numbers)], dtype=np.int64)
+            if order.size < 2:
+                continue
+            columns = table[order].T
+            by_time = np.lexsort(columns[::-1])
+            by_time = by_time[np.diff(columns[0][by_time], prepend=-np.inf) > 0.0]
+            fixes = Fixes(*np.ascontiguousarray(columns[:, by_time]))
+            walls, received = (np.array(one)[order] for one in (self._walls, self._received))
+            yield boot_id, fixes, walls[by_time], received[by_time]
 
 
 def fetch_crossings(
