@@ -32,6 +32,7 @@ from services.identification.comparison import (
 from services.identification.fusing import Floats, FusedBridge, fused
 from services.identification.result_parts import part_of_elements
 from services.identification.usable import LISTED_AT_MOST as LISTED_AT_MOST
+from services.identification.usable import FusableCrossing
 from services.identification.usable import RecentCrossings as RecentCrossings
 from services.identification.usable import add_crossings as add_crossings
 from services.identification.usable import usable as usable
@@ -114,13 +115,7 @@ def state_of(
     found = fused(sources, report, fusing.threads)
     left_out |= dict.fromkeys(found.left_out, LeftOutReason.DISAGREES)
     left_out |= dict.fromkeys(found.other_model, LeftOutReason.OTHER_MODEL)
-    reasons = []
-    if found.disagree:
-        reasons.append(BridgeReason.CROSSINGS_DISAGREE)
-    if len(found.left_out) > _MANY * (len(found.left_out) + len(found.used)):
-        reasons.append(BridgeReason.MANY_LEFT_OUT)
-    if any(one.verdict != "good" and one.crossing_id in found.used for one in wanted):
-        reasons.append(BridgeReason.USES_SUSPECT)
+    reasons = _reasons(found, wanted)
     between = _summary(found.between)
     baseline = fusing.baselines.get(bridge)
     elements = {f"EI_{n}": _summary(ei) for n, ei in enumerate(found.ei_nm2.T, start=1)}
@@ -132,21 +127,37 @@ def state_of(
         between_crossing_std_q025=0.0 if found.between_may_be_zero else between.q025,
         between_crossing_std_q975=between.q975,
         verdict="suspect" if reasons else "good",
-        reasons=tuple(reasons),
+        reasons=reasons,
         weakest_element=f"EI_{weakest}",
         probability_of_loss=None if baseline is None else _losses(ratio),
         level=_level(found, 0.0, 1.0),
-        thirds=ThirdsState(
-            left=_level(found, 0.0, 1 / 3),
-            middle=_level(found, 1 / 3, 2 / 3),
-            right=_level(found, 2 / 3, 1.0),
-        ),
+        thirds=_thirds(found),
         tracks=found.tracks,
         crossings_used=found.used,
         crossings_left_out=_named(left_out),
         crossings_left_out_count=counted.number - len(found.used),
     )
     return state.model_copy(update={"finding": _finding(found, state, baseline)})
+
+
+def _reasons(found: FusedBridge, crossings: Iterable[FusableCrossing]) -> tuple[BridgeReason, ...]:
+    """Return why a state is doubtful; nothing for a good one."""
+    reasons = []
+    if found.disagree:
+        reasons.append(BridgeReason.CROSSINGS_DISAGREE)
+    if len(found.left_out) > _MANY * (len(found.left_out) + len(found.used)):
+        reasons.append(BridgeReason.MANY_LEFT_OUT)
+    if any(one.verdict != "good" and one.crossing_id in found.used for one in crossings):
+        reasons.append(BridgeReason.USES_SUSPECT)
+    return tuple(reasons)
+
+
+def _thirds(found: FusedBridge) -> ThirdsState:
+    return ThirdsState(
+        left=_level(found, 0.0, 1 / 3),
+        middle=_level(found, 1 / 3, 2 / 3),
+        right=_level(found, 2 / 3, 1.0),
+    )
 
 
 class States:

@@ -46,7 +46,6 @@ LONG_FUNCTIONS = {
     "pre_core.paper.residual:build_window": 87,
     "pre_core.paper.residual:march_four": 63,
     "pre_core.physics.march:march": 140,
-    "services.identification.bridge_state:state_of": 69,
     "services.identification.pre_method:identify_pre": 77,
     "services.simulation.wide_cases:draw_wide": 78,
     "services.simulation.out_of_model:draw_out_of_model": 78,
