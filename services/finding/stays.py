@@ -73,6 +73,16 @@ class AxleGeometry(Protocol):
     def gps_antenna_to_front_axle_m(self) -> float: ...  # noqa: D102
 
 
+class AntennaFixes(NamedTuple):
+    """Fixes of a truck beside a bridge: arrays (m,), in order of time."""
+
+    time_s: Floats
+    chainage_m: Floats
+    lateral_m: Floats
+    speed_m_per_s: Floats
+    """Speed according to the receiver."""
+
+
 class _Places(NamedTuple):
     """Positions of the truck at each fix (m,)."""
 
@@ -97,10 +107,7 @@ def stays_on(
     """
     chainage_m, lateral_m = to_chainage(frame, fixes.latitude_deg, fixes.longitude_deg)
     return find_stays(
-        fixes.time_s,
-        chainage_m,
-        lateral_m,
-        fixes.speed_m_per_s,
+        AntennaFixes(fixes.time_s, chainage_m, lateral_m, fixes.speed_m_per_s),
         span_m=bridge.span_m,
         wheelbase_m=vehicle.length_m,
         antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
@@ -109,10 +116,7 @@ def stays_on(
 
 
 def find_stays(
-    time_s: Floats,
-    antenna_m: Floats,
-    lateral_m: Floats,
-    speed_m_per_s: Floats,
+    fixes: AntennaFixes,
     *,
     span_m: float,
     wheelbase_m: float,
@@ -121,10 +125,11 @@ def find_stays(
 ) -> list[Stay]:
     """Return all stays on the bridge, in order of time; the last may still be running.
 
-    Arrays are (m,): chainage and lateral offset of the antenna, and the receiver's speed. Entry and
-    exit are interpolated between fixes, precisely enough to select the samples; the trajectory
-    gives them more precisely. A truck that reaches less than `margin_m` and returns was not on it.
+    Entry and exit are interpolated between fixes, precisely enough to select the samples; the
+    trajectory gives them more precisely. A truck that reaches less than `margin_m` and returns was
+    not on it.
     """
+    time_s, antenna_m, lateral_m, speed_m_per_s = fixes
     if time_s.size < 2:
         return []
     sense = _senses(antenna_m, speed_m_per_s, margin_m)

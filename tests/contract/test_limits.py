@@ -61,7 +61,6 @@ MANY_ARGUMENTS = {
     "services.execution.offline:identify_drives": 8,
     "services.identification.engine:Engine.__init__": 8,
     "services.identification.pre_method:identify_pre": 9,
-    "services.finding.stays:find_stays": 8,
     "services.notebook.simulate:simulate": 10,
     "services.recordings.writer:RecordingWriter.__init__": 9,
     "services.simulation.drive:simulate_drive": 12,

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.finding.stays import CORRIDOR_M, STANDING_M_PER_S, Passage, Stay, _senses, find_stays
+from services.finding.stays import (
+    CORRIDOR_M,
+    STANDING_M_PER_S,
+    AntennaFixes,
+    Passage,
+    Stay,
+    _senses,
+    find_stays,
+)
 
 Floats = NDArray[np.float64]
 
@@ -59,10 +67,7 @@ def stays_of(
     lateral = lateral + noise_m * rng.standard_normal(front.size)
     kept = np.ones(front.size, dtype=bool) if kept is None else kept
     return find_stays(
-        time_s[kept],
-        antenna[kept],
-        lateral[kept],
-        speed[kept],
+        AntennaFixes(time_s[kept], antenna[kept], lateral[kept], speed[kept]),
         span_m=span_m,
         wheelbase_m=WHEELBASE_M,
         antenna_to_front_axle_m=antenna_m,
@@ -354,7 +359,7 @@ def test_no_fixes_no_stays() -> None:
     for size in (0, 1):
         nothing = np.zeros(size)
         sizes = {"span_m": 30.0, "wheelbase_m": 4.4, "antenna_to_front_axle_m": 0.0}
-        assert find_stays(nothing, nothing, nothing, nothing, **sizes) == []
+        assert find_stays(AntennaFixes(nothing, nothing, nothing, nothing), **sizes) == []
 
 
 def test_the_corridor_is_as_wide_as_it_says() -> None:
