@@ -334,18 +334,18 @@ def _draw(folder: Path, crossing: CrossingResult, drive: SimulatedDrive, site: S
     from services.viewer.bridge_view import views_of_bridges
     from services.viewer.crossing_view import view_of_crossing
     from services.viewer.figure import crossing_figure
+    from services.viewer.rerun_file import RerunContent, write_rrd
     from services.viewer.residuals import residual_cells
     from services.viewer.vehicle_signals import signals_of_messages
-    from services.viewer.view import write_views
 
-    write_views(
-        folder / _VIEWS,
-        vehicles=signals_of_messages(read_messages(folder / _RECORDING)),
-        crossings=[crossing],
-        site=site,
-        overviews=views_of_bridges(load_results(folder / _TEXT), site),
-        residuals=residual_cells([crossing], read_messages(folder / _RECORDING), site),
+    content = RerunContent(
+        signals_of_messages(read_messages(folder / _RECORDING)),
+        [crossing],
+        site,
+        views_of_bridges(load_results(folder / _TEXT), site),
+        residual_cells([crossing], read_messages(folder / _RECORDING), site),
     )
+    write_rrd(folder / _VIEWS, content)
     crossing_figure(
         folder / _FIGURE,
         crossing=view_of_crossing(crossing, site.bridge(crossing.bridge)),

@@ -190,9 +190,9 @@ def _write_rerun(
 ) -> None:
     """Write the Rerun file of the results; baselines are relative to `beside`."""
     from services.viewer.bridge_view import views_of_bridges
+    from services.viewer.rerun_file import RerunContent, write_rrd
     from services.viewer.residuals import residual_cells
     from services.viewer.vehicle_signals import signals_of_messages
-    from services.viewer.view import write_views
 
     messages = chain.from_iterable(map(read_messages, recordings))
     with steps_bar("what fits leave over", console) as progress:
@@ -206,15 +206,9 @@ def _write_rerun(
             replaced_atomically(path) as temporary,
             steps_bar(f"drawing {path.name}", console) as drawing,
         ):
-            write_views(
-                temporary,
-                vehicles=vehicles,
-                crossings=found.crossings,
-                site=site,
-                overviews=views_of_bridges(found, site, beside),
-                residuals=left,
-                drawing=drawing,
-            )
+            states = views_of_bridges(found, site, beside)
+            content = RerunContent(vehicles, found.crossings, site, states, left)
+            write_rrd(temporary, content, drawing)
     except RuntimeError as error:  # Rerun's error for a file that cannot be written
         raise FailureError(f"{path}: could not be written: {error}") from error
 

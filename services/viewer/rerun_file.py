@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib
 import numpy as np
@@ -16,13 +17,21 @@ import rerun as rr
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from schemas.results import CrossingResult
+from schemas.site import Site
 from services.common.files import replaced_atomically
 from services.common.progress import Steps, no_step_progress
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.bridge_view import BridgeView, describe_bridge, origin_of
 from services.viewer.crossing_scene import scenes_of
 from services.viewer.crossing_tab import log_crossing, when_and_where
-from services.viewer.crossing_view import CrossingSpan, CrossingView, DetectedCrossingView
+from services.viewer.crossing_view import (
+    CrossingSpan,
+    CrossingView,
+    DetectedCrossingView,
+    ResidualCells,
+    view_of_crossing,
+)
 from services.viewer.drawing import STYLE, figure_bytes
 from services.viewer.drive_figure import draw_drive
 from services.viewer.layout import (
@@ -37,6 +46,7 @@ from services.viewer.rerun_parts import log_channel, log_markdown, send_scalars
 from services.viewer.rerun_places import (
     BridgeOnMap,
     bridges_near_tracks,
+    bridges_of_site,
     log_bridge,
     log_drive_plan,
     log_surroundings,
@@ -55,34 +65,53 @@ _PICTURE_DPI = 110
 class _Count:
     """Counter of the steps done."""
 
-    def __init__(self, describe_bridge: Steps, steps: int) -> None:
-        self._report, self._steps, self._done = describe_bridge, steps, 0
-        describe_bridge(0, steps)
+    def __init__(self, report: Steps, steps: int) -> None:
+        self._report, self._steps, self._done = report, steps, 0
+        report(0, steps)
 
     def one_more(self) -> None:
         self._done += 1
         self._report(self._done, self._steps)
 
 
-def write_rrd(
-    path: Path,
-    *,
-    vehicles: Mapping[str, VehicleSignals],
-    bridges: Sequence[BridgeOnMap],
-    crossings: Sequence[CrossingView],
-    overviews: Sequence[BridgeView] = (),
-    passings: Sequence[DetectedCrossingView] = (),
-    about: str | None = None,
-    drawing: Steps = no_step_progress,
-) -> None:
+class RerunContent(NamedTuple):
+    """Everything that a file shows."""
+
+    vehicles: Mapping[str, VehicleSignals]
+    """Signals by identifier of the truck."""
+    crossings: Sequence[CrossingResult]
+    site: Site | None
+    """Bridges of the crossings; without it only signals are drawn."""
+    overviews: Sequence[BridgeView] = ()
+    """States of bridges with all their crossings, which come first."""
+    residuals: Mapping[str, ResidualCells] = {}
+    """Residual bins by crossing_id."""
+    passings: Sequence[DetectedCrossingView] = ()
+    """Stays that were not identified."""
+    about: str | None = None
+    """Page on the recording in Markdown."""
+
+    def views(self) -> list[CrossingView]:
+        """Return the crossings of known bridges as drawn."""
+        bridges = {} if self.site is None else {bridge.id: bridge for bridge in self.site.bridges}
+        return [
+            view_of_crossing(one, bridges[one.bridge])._replace(
+                residuals=self.residuals.get(one.crossing_id)
+            )
+            for one in self.crossings
+            if one.bridge in bridges
+        ]
+
+
+def write_rrd(path: Path, content: RerunContent, drawing: Steps = no_step_progress) -> None:
     """Write a Rerun file with its own layout; an existing file is replaced as a whole.
 
-    `overviews` are the bridges' states with all their crossings, and come first. `vehicles` are the
-    signals by vehicle identifier. A crossing's accelerations are taken from the signals of its
-    vehicle; one without any, or with fewer channels, is drawn with those it has. `passings` are
-    stays that were not identified; `about` is a page on the recording in Markdown. `drawing` is
-    called for each crossing, and each block of accelerations.
+    A crossing's accelerations are taken from the signals of its vehicle; one without any, or with
+    fewer channels, is drawn with those it has. `drawing` is called for each crossing, and each
+    block of accelerations.
     """
+    vehicles, _, site, overviews, _, passings, about = content
+    crossings, bridges = content.views(), [] if site is None else bridges_of_site(site)
     near = bridges_near_tracks(bridges, vehicles.values())
     scenes = scenes_of(crossings, vehicles, bridges, near, overviews)
     default = blueprint(vehicles, scenes, overviews, passings, bridges=near, about=about)

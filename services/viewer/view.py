@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from importlib import resources
 from pathlib import Path
 
@@ -24,7 +24,6 @@ from rich.console import Console
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import CrossingResult, load_results
 from schemas.results_on_the_wire import estimate_to_crossing
-from schemas.site import Site
 from schemas.site_file import load_site
 from schemas.topics import Message
 from services.catalogue.contents import summarise_recording
@@ -39,18 +38,12 @@ from services.common.progress import (
 from services.finding.drive import Drives
 from services.ledger.site_of_results import site_of_results
 from services.recordings.recording import check_envelope, check_message, read_messages
-from services.viewer.bridge_view import BridgeView, views_of_bridges
-from services.viewer.crossing_view import (
-    CrossingView,
-    DetectedCrossingView,
-    ResidualCells,
-    view_of_crossing,
-)
+from services.viewer.bridge_view import views_of_bridges
+from services.viewer.crossing_view import ResidualCells
 from services.viewer.recording_page import detected_views, recording_page
-from services.viewer.rerun_file import write_rrd
-from services.viewer.rerun_places import bridges_of_site
+from services.viewer.rerun_file import RerunContent, write_rrd
 from services.viewer.residuals import residual_cells
-from services.viewer.vehicle_signals import VehicleSignals, signals_of
+from services.viewer.vehicle_signals import signals_of
 
 SUFFIXES = (".rrd", ".mcap", ".json")
 _SCREENS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
@@ -107,14 +100,8 @@ def convert(
     if target.suffix == ".json":
         results = load_results(target)
         bridges = site_of_results(target, results, site)
-        write_views(
-            rrd,
-            vehicles={},
-            crossings=results.crossings,
-            site=bridges,
-            overviews=views_of_bridges(results, bridges, (site or target).parent),
-            drawing=drawing,
-        )
+        states = views_of_bridges(results, bridges, (site or target).parent)
+        write_rrd(rrd, RerunContent({}, results.crossings, bridges, states), drawing)
         return
     drives, estimates = Drives(), list[Message]()
 
@@ -137,16 +124,15 @@ def convert(
     if crossings and found.site is not None:
         messages = read_messages(target)
         residuals = residual_cells(crossings, messages, found.site, most=_MAX_RESIDUALS)
-    write_views(
-        rrd,
-        vehicles=signals_of(drives.all()),
-        crossings=crossings,
-        site=found.site,
-        passings=detected_views(found, crossings),
+    content = RerunContent(
+        signals_of(drives.all()),
+        crossings,
+        found.site,
         residuals=residuals,
+        passings=detected_views(found, crossings),
         about=recording_page(found),
-        drawing=drawing,
     )
+    write_rrd(rrd, content, drawing)
 
 
 @contextlib.contextmanager
@@ -162,44 +148,6 @@ def _paused_gc() -> Iterator[None]:
     finally:
         if was_enabled:
             gc.enable()
-
-
-def write_views(
-    rrd: Path,
-    *,
-    vehicles: dict[str, VehicleSignals],
-    crossings: Iterable[CrossingResult],
-    site: Site | None,
-    overviews: Sequence[BridgeView] = (),
-    passings: Sequence[DetectedCrossingView] = (),
-    residuals: Mapping[str, ResidualCells] | None = None,
-    about: str | None = None,
-    drawing: Steps = no_step_progress,
-) -> None:
-    """Write a Rerun file of results and signals; without a site only the signals are drawn.
-
-    `residuals` are by crossing_id.
-    """
-    bridges = {} if site is None else {bridge.id: bridge for bridge in site.bridges}
-    left = residuals or {}
-    views: list[CrossingView] = [
-        view_of_crossing(crossing, bridges[crossing.bridge])._replace(
-            residuals=left.get(crossing.crossing_id)
-        )
-        for crossing in crossings
-        if crossing.bridge in bridges
-    ]
-    on_map = [] if site is None else bridges_of_site(site)
-    write_rrd(
-        rrd,
-        vehicles=vehicles,
-        bridges=on_map,
-        crossings=views,
-        overviews=overviews,
-        passings=passings,
-        about=about,
-        drawing=drawing,
-    )
 
 
 def crossings_of_messages(messages: Iterable[Message]) -> list[CrossingResult]:

@@ -67,8 +67,6 @@ MANY_ARGUMENTS = {
     "services.simulation.two_sided_surface:_heights": 9,
     "services.simulation.wide_crossings:road_under": 8,
     "studies.paper.scenarios:run_scenario": 8,
-    "services.viewer.rerun_file:write_rrd": 8,
-    "services.viewer.view:write_views": 9,
 }
 
 ROOMS_WITH_CODE = {

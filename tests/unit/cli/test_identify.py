@@ -306,11 +306,11 @@ def test_a_failing_writer_leaves_the_files_of_yesterday(
     out = tmp_path / "out.rrd"
     out.write_text("RRF2 of yesterday")
 
-    def fail(path: Path, **_: object) -> None:
+    def fail(path: Path, *_: object) -> None:
         path.write_bytes(b"half")
         raise RuntimeError("broken")
 
-    monkeypatch.setattr("services.viewer.view.write_rrd", fail)
+    monkeypatch.setattr("services.viewer.rerun_file.write_rrd", fail)
     arguments = ["identify", str(recording), "--method", "least-squares", "--rrd", str(out)]
     assert cli.main(arguments) == 1
     assert out.read_text() == "RRF2 of yesterday"

@@ -22,11 +22,12 @@ from services.viewer.crossing_view import CrossingView, view_of_crossing
 from services.viewer.drawing import STYLE
 from services.viewer.layout import blueprint
 from services.viewer.panels.verdict import verdict_markdown
+from services.viewer.rerun_file import RerunContent, write_rrd
 from services.viewer.rerun_parts import log_markdown
 from services.viewer.rerun_places import bridges_of_site
 from services.viewer.strip import rigidity_strip
 from services.viewer.vehicle_signals import signals_of_messages
-from services.viewer.view import convert, write_views
+from services.viewer.view import convert
 from tests.unit.drives.recorded import drive
 from tests.unit.viewer.found import results_of, some_crossing
 from tests.viewer_screen import complaints, opened, picture, pixels, view_named
@@ -177,13 +178,7 @@ def test_every_view_has_something_to_show(tmp_path: Path, site: Site, verdict: s
     found = results_of(site, some_crossing("a", verdict=verdict, reasons=reasons), used=used)
     signals = signals_of_messages(drive())
     overviews = views_of_bridges(found, site)
-    write_views(
-        tmp_path / "found.rrd",
-        vehicles=signals,
-        crossings=found.crossings,
-        site=site,
-        overviews=overviews,
-    )
+    write_rrd(tmp_path / "found.rrd", RerunContent(signals, found.crossings, site, overviews))
     entities = {
         chunk.entity_path for chunk in RrdReader(tmp_path / "found.rrd").stream().to_chunks()
     }
@@ -213,7 +208,7 @@ def test_panel_is_laid_out_and_drawn_where_it_has_data(
     reasons = () if verdict == "good" else ("position_outage",)
     found = results_of(site, some_crossing("a", verdict=verdict, reasons=reasons))
     views = [view_of_crossing(crossing, site.bridges[0]) for crossing in found.crossings]
-    write_views(tmp_path / "a.rrd", vehicles={}, crossings=found.crossings, site=site)
+    write_rrd(tmp_path / "a.rrd", RerunContent({}, found.crossings, site))
     drawn = {chunk.entity_path for chunk in RrdReader(tmp_path / "a.rrd").stream().to_chunks()}
     scenes = scenes_of(views, {}, [], [], [])
     named = set(origins(blueprint({}, scenes).root_container))

@@ -15,8 +15,9 @@ from services.common.geodesy import bridge_frame, to_lat_lon
 from services.recordings.writer import write_recording
 from services.viewer.drawing import WEAK_BAR
 from services.viewer.recording_page import detected_views, recording_page
+from services.viewer.rerun_file import RerunContent, write_rrd
 from services.viewer.rerun_parts import WEAK, ratio_colours, rgb
-from services.viewer.view import convert, write_views
+from services.viewer.view import convert
 from tests.unit.drives.recorded import START_NS, drive
 from tests.unit.viewer.found import results_of, some_crossing
 
@@ -106,7 +107,7 @@ def test_the_map_shows_each_element_with_the_colour_of_what_was_found(
 ) -> None:
     found = results_of(site, some_crossing("a"))
     rrd = tmp_path / "found.rrd"
-    write_views(rrd, vehicles={}, crossings=found.crossings, site=site)
+    write_rrd(rrd, RerunContent({}, found.crossings, site))
     (chunk,) = (
         c
         for c in RrdReader(rrd).stream().to_chunks()

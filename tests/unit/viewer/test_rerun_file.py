@@ -32,6 +32,7 @@ from services.viewer.crossing_scene import CrossingScene, crossing_root
 from services.viewer.crossing_view import CrossingView, front_axle_chainage, view_of_crossing
 from services.viewer.layout import blueprint
 from services.viewer.panels.verdict import verdict_markdown
+from services.viewer.rerun_file import RerunContent, write_rrd
 from services.viewer.rerun_parts import CHAINAGE
 from services.viewer.rerun_places import bridges_near_tracks, bridges_of_site
 from services.viewer.strip import STRIP_HEIGHT, STRIP_WIDTH, rigidity_strip
@@ -44,7 +45,6 @@ from services.viewer.view import (
     convert,
     view_command,
     viewer_arguments,
-    write_views,
 )
 from tests.viewer_screen import complaints, open_tab, opened, picture, pixels, view_named
 from tests.waiting import LONGEST_S, until
@@ -197,7 +197,7 @@ def times_ns(batch: pa.RecordBatch) -> np.ndarray:
 def drive(tmp_path: Path, site: Site) -> tuple[list[Chunk], CrossingView]:
     path = tmp_path / "drive.rrd"
     vehicles = {"truck-1": VehicleSignals(accel(), gnss())}
-    write_views(path, vehicles=vehicles, crossings=[crossing()], site=site)
+    write_rrd(path, RerunContent(vehicles, [crossing()], site))
     view = view_of_crossing(crossing(), site.bridges[0])
     return RrdReader(path).stream().to_chunks(), view
 
@@ -215,7 +215,7 @@ def test_named_channels_are_drawn(tmp_path: Path, site: Site) -> None:
     names = ("sprung_front", "axle_1_left", "axle_1_right")
     path = tmp_path / "named.rrd"
     vehicles = {"truck-1": VehicleSignals(accel(channels=names), gnss())}
-    write_views(path, vehicles=vehicles, crossings=[crossing()], site=site)
+    write_rrd(path, RerunContent(vehicles, [crossing()], site))
     chunks = RrdReader(path).stream().to_chunks()
     view = view_of_crossing(crossing(), site.bridges[0])
     for channel in names:
@@ -316,7 +316,7 @@ def test_bars_begin_and_end_on_their_elements(drive):
 def test_rejected_crossing_shows_its_reason_and_no_number(tmp_path: Path, site: Site) -> None:
     path = tmp_path / "rejected.rrd"
     vehicles = {"truck-1": VehicleSignals(accel(channels=("sprung_front",)), gnss())}
-    write_views(path, vehicles=vehicles, crossings=[rejected()], site=site)
+    write_rrd(path, RerunContent(vehicles, [rejected()], site))
     chunks = RrdReader(path).stream().to_chunks()
     root = crossing_root(view_of_crossing(rejected(), site.bridges[0]))
     assert f"{root}/verdict" in paths(chunks)
@@ -529,7 +529,7 @@ def test_recording_opened_directly_is_drawn_on_a_map(tmp_path: Path) -> None:
 def test_rerun_file_has_its_layout_and_draws_without_complaint(tmp_path: Path, site: Site) -> None:
     path = tmp_path / "drive.rrd"
     vehicles = {"truck-1": VehicleSignals(accel(), gnss())}
-    write_views(path, vehicles=vehicles, crossings=[crossing()], site=site)
+    write_rrd(path, RerunContent(vehicles, [crossing()], site))
     with opened(path, tmp_path) as viewer:
         assert {view.view_class for view in viewer.get_state().views} == {
             "BarChart",
@@ -575,7 +575,7 @@ def test_a_long_drive_is_sent_in_pieces_with_every_sample_and_gap(
     monkeypatch.setattr(rerun_file, "_PIECE", 9)
     path = tmp_path / "drive.rrd"
     vehicles = {"truck-1": VehicleSignals(batches, gnss())}
-    write_views(path, vehicles=vehicles, crossings=[crossing()], site=site)
+    write_rrd(path, RerunContent(vehicles, [crossing()], site))
     chunks = RrdReader(path).stream().to_chunks()
     for channel in CHANNELS:
         found = rows(chunks, f"vehicle/truck-1/acceleration/{channel}")

@@ -14,8 +14,8 @@ from schemas.settings import IdentificationSettings
 from services.execution.offline import identify_recordings, site_of
 from services.recordings.recording import read_messages
 from services.viewer.panels.residuals import band_names
+from services.viewer.rerun_file import RerunContent, write_rrd
 from services.viewer.residuals import _by_band, residual_cells
-from services.viewer.view import write_views
 
 Cells = dict[tuple[int, int, int], quality.ResidualBin]
 
@@ -103,7 +103,7 @@ def test_the_table_is_in_the_rerun_file_and_only_of_what_is_known(
     left = residual_cells(found.crossings, read_messages(sample), site)
     for residuals in (left, {}):
         path = tmp_path / f"{len(residuals)}.rrd"
-        write_views(path, vehicles={}, crossings=found.crossings, site=site, residuals=residuals)
+        write_rrd(path, RerunContent({}, found.crossings, site, residuals=residuals))
         entities = {c.entity_path: c for c in RrdReader(path).stream().to_chunks()}
         values = [name for name in entities if name.endswith("/residuals/value")]
         assert len(values) == len(residuals)

@@ -18,7 +18,7 @@ from schemas.site_file import load_site
 from services.common.errors import FailureError
 from services.report.pdf import find_browser
 from services.viewer.bridge_view import views_of_bridges
-from services.viewer.view import write_views
+from services.viewer.rerun_file import RerunContent, write_rrd
 from tests.unit.viewer.found import results_of, some_crossing
 from tests.viewer_screen import pixels
 from tests.waiting import LONGEST_S, until
@@ -117,7 +117,7 @@ def test_the_bridge_is_seen_in_a_browser(tmp_path: Path, project: Path) -> None:
     found = results_of(site, some_crossing("a"), used="a")
     rrd = tmp_path / "found.rrd"
     overviews = views_of_bridges(found, site)
-    write_views(rrd, vehicles={}, crossings=found.crossings, site=site, overviews=overviews)
+    write_rrd(rrd, RerunContent({}, found.crossings, site, overviews))
     with browser(tmp_path) as tab, served(rrd, tmp_path) as address:
         tab.open(address)
         weak = np.array([230, 159, 0]) / 255.0
