@@ -41,10 +41,10 @@ LONG_CLASSES = {
 }
 
 LONG_FUNCTIONS = {
-    "pre_core.crossing.preparation:build_problem": 77,
+    "pre_core.crossing.preparation:build_problem": 72,
     "pre_core.monitoring.change_detection:detect_change": 71,
     "pre_core.paper.residual:build_window": 87,
-    "pre_core.paper.residual:march_four": 63,
+    "pre_core.paper.residual:march_four": 62,
     "pre_core.physics.march:march": 140,
     "services.identification.pre_method:identify_pre": 77,
     "services.simulation.wide_cases:draw_wide": 78,
