@@ -55,9 +55,13 @@ def reasons_of_fit(
     fit = _fit(data, found)
     names, densities = middle_names(data.vehicle), data.sensor.noise_density_ug_per_rthz
     slipped = steps_of_channels(names, fit)
-    if slipped and found.unfinished is not None and fit_off_bridge(found).chi2 <= EXPLAINED_CHI2:
-        slipped = {}  # a channel that steps would not be explained before and behind the bridge
-    reasons = [*slipped, *reasons_after_fit(data, fit)]
+    reasons = reasons_after_fit(data, fit)
+    off_bridge_chi2 = np.inf
+    if Reason.MODEL_MISFIT in reasons or (slipped and found.unfinished is not None):
+        off_bridge_chi2 = fit_off_bridge(found).chi2
+    if found.unfinished is not None and off_bridge_chi2 <= EXPLAINED_CHI2:
+        slipped = {}  # a channel that steps would not be explained before and after the bridge
+    reasons = [*slipped, *reasons]
     if found.ending is not Termination.CONVERGED:
         reasons.append(Reason.NOT_CONVERGED)
     axles = undeclared_axles(data.vehicle, acceleration, step_s, is_doubted=bool(reasons))
@@ -67,7 +71,7 @@ def reasons_of_fit(
     about = {
         **slipped,
         **axles,
-        Reason.MODEL_MISFIT: _place_of_misfit(found) if Reason.MODEL_MISFIT in reasons else "",
+        Reason.MODEL_MISFIT: _place_of_misfit(off_bridge_chi2),
         Reason.NOISE_ABOVE_DECLARED: coarse,
         Reason.IMPLAUSIBLE_VEHICLE: odd_parameters(fit),
         Reason.TANDEM_FRICTION: f"about {100.0 * fit.tandem_friction:.2g} % of their load",
@@ -75,19 +79,22 @@ def reasons_of_fit(
     return ReasonsOfFit((*axles, *reasons), about, bool(slipped) or is_biased_by_mismatch(fit))
 
 
-def _place_of_misfit(found: Optimum) -> str:
-    """Return where the model fails, with the likely causes, or "" if that is not clear."""
-    elsewhere = fit_off_bridge(found).chi2
-    if EXPLAINED_CHI2 < elsewhere < _UNEXPLAINED_CHI2 or not np.isfinite(elsewhere):
+def _place_of_misfit(off_bridge_chi2: float) -> str:
+    """Return where the model fails, with the likely causes, or "" if that is not clear.
+
+    It follows from the chi2 of truck and road fitted off the bridge alone.
+    """
+    is_between = EXPLAINED_CHI2 < off_bridge_chi2 < _UNEXPLAINED_CHI2
+    if is_between or not np.isfinite(off_bridge_chi2):
         return ""
-    if elsewhere <= EXPLAINED_CHI2:
+    if off_bridge_chi2 <= EXPLAINED_CHI2:
         return (
             "only on the bridge; likely causes are another vehicle on it, an undeclared support, a "
             "wrong span, or a bridge that is no beam"
         )
     return (
-        f"also before and behind the bridge (χ² {elsewhere:.2g}); likely causes are another truck "
-        "than declared, a faulty sensor, or different profiles under the axles"
+        f"also before and behind the bridge (χ² {off_bridge_chi2:.2g}); likely causes are another "
+        "truck than declared, a faulty sensor, or different profiles under the axles"
     )
 
 

@@ -1,16 +1,13 @@
 """Where a misfit is: the text of its reason."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
-from pre_core.crossing.misfit import OffBridgeFit
-from services.identification import fit_reasons
+from services.identification.fit_reasons import _place_of_misfit
 
 
 @pytest.mark.parametrize(
-    ("chi2", "text"),
+    ("off_bridge_chi2", "text"),
     [
         (np.inf, ""),
         (0.9, "only on the bridge"),
@@ -19,11 +16,6 @@ from services.identification import fit_reasons
         (12.3, "also before and behind the bridge (χ² 12)"),
     ],
 )
-def test_the_text_of_a_misfit_says_where_it_is(
-    chi2: float, text: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fit = OffBridgeFit(np.zeros(1), chi2, 0)
-    monkeypatch.setattr(fit_reasons, "fit_off_bridge", lambda _: fit)
-    found: Any = None
-    seen = fit_reasons._place_of_misfit(found)
+def test_the_text_of_a_misfit_says_where_it_is(off_bridge_chi2: float, text: str) -> None:
+    seen = _place_of_misfit(off_bridge_chi2)
     assert seen.startswith(text) if text else seen == ""
