@@ -86,9 +86,11 @@ class Spool:
         self._lock_file = _locked(folder)
         with _closed_on_error(self._lock_file, folder):
             highest, self._past = _read_state(folder / _STATE)
-            self._segments = [
-                segment for path in sorted(folder.glob("*.spool")) if (segment := self._load(path))
-            ]
+            self._segments = []
+            for path in sorted(folder.glob("*.spool")):
+                segment, torn_bytes = _load(path)
+                self.torn_bytes += torn_bytes
+                self._segments += [segment] if segment is not None else []
         boots = [highest, *(segment.boot_id for segment in self._segments)]
         self.boot_id = max(time.time_ns(), max(boots) + 1)
         """Higher than any before, also where the wall clock went back in between."""
@@ -301,29 +303,6 @@ class Spool:
             for name in [name for name in self._past if name[1] == boot_id and name not in held]:
                 del self._past[name]
 
-    def _load(self, path: Path) -> "_Segment | None":
-        """Read a segment of an earlier boot and remove its torn end; None if nothing is left."""
-        content = _read_file(path, path.stat().st_size)
-        boot_id = _boot_of(path, content)
-        if boot_id is None:
-            self.torn_bytes += len(content)
-            _log.warning("%s: not a segment of a spool, removed (%d bytes)", path, len(content))
-            path.unlink()
-            return None
-        segment = _Segment(path, boot_id, _HEADER.size)
-        for record in _records(content):
-            segment.streams.setdefault(record.stream, Intervals()).add(record.sequence)
-            segment.size = record.end
-        torn = len(content) - segment.size
-        if torn:
-            self.torn_bytes += torn
-            _log.warning("%s: removed %d incomplete bytes at its end", path, torn)
-            os.truncate(path, segment.size)
-        if not segment.streams:
-            path.unlink()
-            return None
-        return segment
-
 
 @dataclass
 class _BootTotals:
@@ -341,6 +320,28 @@ class _Segment:
     def holds_any(self, stream: str, first: int, last: int) -> bool:
         numbers = self.streams.get(stream)
         return numbers is not None and any(a <= last and b >= first for a, b in numbers.ranges())
+
+
+def _load(path: Path) -> tuple[_Segment | None, int]:
+    """Return a segment of an earlier boot, None if nothing is left, and the torn bytes removed."""
+    content = _read_file(path, path.stat().st_size)
+    boot_id = _boot_of(path, content)
+    if boot_id is None:
+        _log.warning("%s: not a segment of a spool, removed (%d bytes)", path, len(content))
+        path.unlink()
+        return None, len(content)
+    segment = _Segment(path, boot_id, _HEADER.size)
+    for record in _records(content):
+        segment.streams.setdefault(record.stream, Intervals()).add(record.sequence)
+        segment.size = record.end
+    torn = len(content) - segment.size
+    if torn:
+        _log.warning("%s: removed %d incomplete bytes at its end", path, torn)
+        os.truncate(path, segment.size)
+    if not segment.streams:
+        path.unlink()
+        return None, torn
+    return segment, torn
 
 
 class _Record(NamedTuple):

@@ -37,7 +37,6 @@ LONG_MODULES = {
 LONG_CLASSES = {
     "services.execution.cluster:DaskExecutor": 273,
     "services.logger.writer:FileWriter": 392,
-    "services.truck.spool:Spool": 257,
 }
 
 LONG_FUNCTIONS = {
