@@ -33,6 +33,7 @@ from services.common.files import (
 from services.common.options import CERTIFICATES
 from services.common.progress import parts_bar, reading_bar, steps_bar
 from services.execution.dispatch import CrossingExecutor
+from services.execution.inline import InlineExecutor
 from services.execution.offline import identify_drives, messages_of_trucks, site_of
 from services.finding.order import index_messages
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
@@ -154,11 +155,10 @@ def _found(
             drives,
             known,
             request.settings,
+            execution or InlineExecutor(report=report, keep=draws.__setitem__),
             report,
-            keep=draws.__setitem__,
-            fusing=request.fusing,
-            certificates=request.certificates,
-            execution=execution,
+            request.fusing,
+            request.certificates,
         )
 
 

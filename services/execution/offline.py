@@ -90,23 +90,22 @@ def identify_recordings(
     """
     name = ", ".join(str(path) for path in recordings)
     overview = index_messages(name, messages_of_trucks(recordings), site)
-    return identify_drives(overview, site, settings, report, keep, fusing, certificates)
+    execution = InlineExecutor(report=report, keep=keep)
+    return identify_drives(overview, site, settings, execution, report, fusing, certificates)
 
 
 def identify_drives(
     drives: MessageIndex,
     site: Site,
     settings: IdentificationSettings,
+    execution: CrossingExecutor,
     report: Report = _ignore_progress,
-    keep: Keep = lambda crossing_id, draws: None,
     fusing: Fusing = NOTHING_STORED,
     certificates: Mapping[VehicleBridgePair, str] | None = None,
-    execution: CrossingExecutor | None = None,
 ) -> Results:
     """Identify all crossings in the drives, which are read again, message by message.
 
-    `report` is called with the progress of every crossing and, at the end, with its completion. An
-    `execution` elsewhere (None: inline) reports progress and draws itself.
+    The execution reports progress; `report` is called with the completion of every crossing.
 
     Raise InputError if the site has none of the trucks.
     """
@@ -115,7 +114,6 @@ def identify_drives(
     engine = Engine(
         site, settings, header, fusing, certificates=certificates, publishes_states=False
     )
-    execution = InlineExecutor(report=report, keep=keep) if execution is None else execution
     _check_vehicles(drives.name, site, drives.drove)
     for message in drives.near:
         engine.expect(message.key, message.payload, for_ever=True)

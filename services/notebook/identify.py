@@ -8,6 +8,7 @@ from schemas.results import Method
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from services.common.errors import InputError
+from services.execution.inline import InlineExecutor
 from services.execution.offline import identify_drives
 from services.finding.order import Read, cached_reader, index_messages
 from services.history.draws import Draws
@@ -55,7 +56,8 @@ def identify(
         if fraction < 1.0:
             say(f"{crossing_id}: {stage}")
 
-    found = identify_drives(index_messages(name, read, known), known, settings, report, keep)
+    execution = InlineExecutor(report=report, keep=keep)
+    found = identify_drives(index_messages(name, read, known), known, settings, execution, report)
     solutions = (
         Solution(c, known.bridge(c.bridge), kept.get(c.crossing_id, {})) for c in found.crossings
     )

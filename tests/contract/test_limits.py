@@ -57,7 +57,6 @@ MANY_ARGUMENTS = {
     "pre_core.paper.residual:build_window": 15,
     "pre_core.physics.newmark:_march": 9,
     "pre_core.physics.simulate:simulate": 11,
-    "services.execution.offline:identify_drives": 8,
     "services.identification.engine:Engine.__init__": 8,
     "services.identification.pre_method:identify_pre": 9,
     "services.notebook.simulate:simulate": 10,
