@@ -356,14 +356,14 @@ class _Announcements:
         writer = self._logger.writer
         figures: dict[str, float] = dict(count_all(self._logger.intake.counts, writer))
         figures |= writer.take_figures()
-        if writer.free_bytes is not None:
-            figures["disk_free_bytes"] = writer.free_bytes
+        if writer.room.free_bytes is not None:
+            figures["disk_free_bytes"] = writer.room.free_bytes
         figures |= self._completeness.figures()
         message = pb.Health(
             schema_version=1,
             time_ns=time.time_ns(),
             service=self._logger.service_id,
-            ok=writer.failure is None and not writer.dropped and not writer.is_disk_low,
+            ok=writer.failure is None and not writer.dropped and not writer.room.is_low,
             figures={name: float(value) for name, value in figures.items()},
             note=writer.failure or "",
         )

@@ -3,19 +3,14 @@
 A file is closed, with END and the reason, when it is old or large enough, on request, and when its
 truck has been quiet for long; the next message of that truck begins a new one. Only this thread
 writes, and it rotates between two messages, so that none is lost or repeated.
-
-Longer than other modules, because the state of that thread is coupled: closing a file, for age,
-space, a failure or loss, requires the messages that were not yet synced.
 """
 
-import contextlib
 import logging
 import threading
 import time
-from collections import Counter, OrderedDict, deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,20 +18,28 @@ from schemas.events import Event, EventKind
 from schemas.proto import driveby_pb2 as pb
 from schemas.topics import Key, Message, topic
 from services.common.disk import DISK, Disk
-from services.common.errors import InputError
 from services.common.intervals import Intervals
 from services.logger.backlog import Backlog
 from services.logger.cataloguing import Cataloguing
+from services.logger.disk_room import DiskRoom, NoRoomError
 from services.logger.drops import FAILED, QUEUE_IS_FULL, Drop, Drops
 from services.logger.durable import DurableStreams
 from services.logger.file_layout import (
     SERVICE_FILE,
     FileName,
     RecordingTarget,
-    belongs_to,
     file_of,
     file_slot,
     free_path,
+)
+from services.logger.latched import LatchedMessages
+from services.logger.open_file import (
+    OpenFile,
+    WriteFailed,
+    close_after_failure,
+    failing,
+    failure_of,
+    synced,
 )
 from services.logger.own_events import OwnEvents
 from services.recordings.recording import Identities
@@ -53,11 +56,6 @@ QUIET_S = 300.0
 """Silence of a truck after which it gets a new file."""
 _DISK_CHECK_S = 1.0
 """Interval of checks of free space."""
-_STOP_SHARE = 0.125
-"""Share of the minimum free space at which recording stops, while files can still be closed
-properly."""
-_MAX_LATCHED_BYTES = 16 << 20
-"""Largest size of latched messages, which begin every new file; beyond, the oldest are omitted."""
 
 
 class RotationLimits(NamedTuple):
@@ -68,16 +66,6 @@ class RotationLimits(NamedTuple):
     min_free_bytes: int = 0
     """Free space below which the logger does not start, and warns while it runs; it stops at an
     eighth."""
-
-
-@dataclass
-class _Open:
-    """A file that is being written."""
-
-    file: RecordingWriter
-    since_s: float
-    last_s: float
-    dropped_before: int
 
 
 class FileWriter:
@@ -96,10 +84,6 @@ class FileWriter:
         self.failure: str | None = None
         """Set once when writing failed; nothing is written after that."""
         self.written = 0
-        self.free_bytes: int | None = None
-        """Room on the disk when it was last looked at."""
-        self.is_disk_low = False
-        """Whether that is less than the limits want."""
         self.withdrawn: deque[Identities] = deque()
         """Messages that were in files which are gone, and may come again; the caller empties it."""
         self.unwritten: deque[Identities] = deque()
@@ -111,11 +95,11 @@ class FileWriter:
         self._place = place
         self.limits = limits
         self._disk = disk
+        self.room = DiskRoom(self._folder(), limits.min_free_bytes, disk)
         self._own = own or OwnEvents("logger", time.time_ns())
-        self._files: dict[FileName, _Open] = {}
+        self._files: dict[FileName, OpenFile] = {}
         self._closed_names: dict[FileName, str] = {}
-        self._latched: OrderedDict[Key, Message] = OrderedDict()
-        self._latched_bytes = 0
+        self._latched = LatchedMessages()
         self._rotation_asked = threading.Event()
         self._backlog = Backlog() if backlog is None else backlog
         self._unsynced: list[tuple[FileName, Message]] = []
@@ -200,7 +184,7 @@ class FileWriter:
             reason, counts = self._end
             for name in list(self._files):
                 self._close(name, reason, counts)
-        except _WriteFailed as failed:
+        except WriteFailed as failed:
             self._stop(failed.name, f"recording stopped: {failed.reason}", failed.kind)
         except Exception as error:  # any error must be reported, and no thread left waiting
             _log.exception("writing failed; recording stops")
@@ -249,15 +233,15 @@ class FileWriter:
         try:
             opened.file.write(message)
         except OSError as error:
-            raise _failed(name, error) from error
+            raise failure_of(name, error) from error
         if topic(message.key.owner, message.key.stream).latched:
-            self._remember(message)
+            self._latched.add(message)
         if self._place.file is None and opened.file.tell() >= self.limits.bytes:
             self._close(name, "rotated: size")
 
     def _sync(self) -> None:
         # In parallel: a disk syncs many in little more time than one.
-        done = [self._syncing.submit(_synced, *item) for item in self._files.items()]
+        done = [self._syncing.submit(synced, *item) for item in self._files.items()]
         wait(done)
         misplaced = {name: one.result() for name, one in zip(self._files, done, strict=True)}
         gone = {name for name, what in misplaced.items() if what in ("deleted", "cut short")}
@@ -273,17 +257,17 @@ class FileWriter:
             if what is not None:
                 self._replace(name, what)
 
-    def _begin(self, name: FileName, where: Key) -> _Open:
+    def _begin(self, name: FileName, where: Key) -> OpenFile:
         """Open the next file of a truck."""
         previous = self._closed_names.get(name)
-        with _failing(name):
+        with failing(name):
             return self._open(
                 name,
                 free_path(self._place, *name),
                 "logger started" if previous is None else "rotated",
                 previous,
                 # The message that begins the file follows by itself.
-                [m for k, m in self._latched.items() if k != where and belongs_to(k, name)],
+                self._latched.of_file(name, without=where),
             )
 
     def _open(
@@ -293,7 +277,7 @@ class FileWriter:
         reason: str,
         previous: str | None = None,
         latched: list[Message] | None = None,
-    ) -> _Open:
+    ) -> OpenFile:
         realm, vehicle = (self._place.realm, None) if name == ("", "") else name
         writer = RecordingWriter(
             path,
@@ -307,19 +291,19 @@ class FileWriter:
         )
         _log.info("recording to %s", path)
         now_s = time.monotonic()
-        opened = self._files[name] = _Open(writer, now_s, now_s, self._drops.of(*name))
+        opened = self._files[name] = OpenFile(writer, now_s, now_s, self._drops.of(*name))
         return opened
 
     def _close(self, name: FileName, reason: str, counts: Mapping[str, int] | None = None) -> None:
         opened = self._files[name]
-        with _failing(name):
+        with failing(name):
             what = opened.file.displacement()
         if what in ("deleted", "cut short"):
             self._replace(name, what)
             opened = self._files[name]
         if counts is None:
             counts = {"dropped": self._drops.of(*name) - opened.dropped_before}
-        with _failing(name):
+        with failing(name):
             opened.file.finish(reason, counts)
         del self._files[name]
         self._closed_names[name] = opened.file.path.name
@@ -330,16 +314,12 @@ class FileWriter:
     def _replace(self, name: FileName, what: Misplaced) -> None:
         """Begin a new file for one that was deleted, cut or moved, and write an event."""
         file = self._files.pop(name).file
-        latched = [
-            message
-            for key, message in self._latched.items()
-            if message.sequence in file.identities.get((key, message.boot_id), Intervals())
-        ]
+        latched = self._latched.among(file.identities)
         text = f"{file.path.name} was {what} by somebody else while it was being written"
         number = 0
         if what == "moved":
             text += f"; it holds {file.messages} messages"
-            with _failing(name):
+            with failing(name):
                 file.finish("moved", {})
         else:
             file.abandon()
@@ -353,7 +333,7 @@ class FileWriter:
             self._unsynced = [(n, m) for n, m in self._unsynced if n != name]
             self.withdrawn.append(gone)
             text += f": {number} messages are gone, {confirmed} of them were confirmed as durable"
-        with _failing(name):
+        with failing(name):
             path = free_path(self._place, *name)
             self._open(name, path, f"the file before it was {what}", file.path.name, latched)
         self._durable.add(latched)
@@ -382,31 +362,15 @@ class FileWriter:
         for name in list(self._files):
             self._close(name, "rotated: on request")
 
-    def _remember(self, message: Message) -> None:
-        before = self._latched.pop(message.key, None)
-        self._latched_bytes -= len(before.payload) if before is not None else 0
-        self._latched[message.key] = message
-        self._latched_bytes += len(message.payload)
-        while self._latched_bytes > _MAX_LATCHED_BYTES:
-            _, oldest = self._latched.popitem(last=False)
-            self._latched_bytes -= len(oldest.payload)
-
     def _folder(self) -> Path:
         return self._place.file.parent if self._place.file is not None else self._place.folder
 
     def _look_at_disk(self) -> None:
-        folder = self._folder()
         try:
-            self.free_bytes = self._disk.free_bytes(folder)
-        except OSError as error:
-            _log.error("%s: %s", folder, error.strerror)
-            return
-        floor = self.limits.min_free_bytes
-        left = f"{self.free_bytes / 1e6:.0f} MB left on the disk of {folder}"
-        if self.free_bytes < floor * _STOP_SHARE:
-            raise _WriteFailed(None, f"only {left}", EventKind.DISK_LOW)
-        was_low, self.is_disk_low = self.is_disk_low, self.free_bytes < floor
-        if self.is_disk_low and not was_low:
+            left = self.room.check()
+        except NoRoomError as error:
+            raise WriteFailed(None, str(error), EventKind.DISK_LOW) from None
+        if left is not None:
             self._write_event(Event(EventKind.DISK_LOW, time.time_ns(), left))
 
     def _write_event(self, event: Event) -> None:
@@ -439,8 +403,9 @@ class FileWriter:
             message = self._own.message(name[0] or self._place.realm or "live", event)
             self.said.append(message)
             mine = [m for n, m in self._unsynced if n == name]
+            counts = {"dropped": self._drops.of(*name) - opened.dropped_before}
             at_fault = name == failed
-            number = self._close_after_failure(name, opened, failure, message, is_failed=at_fault)
+            number = close_after_failure(opened, failure, counts, message, is_failed=at_fault)
             number = len(mine) if number is None else min(number, len(mine))
             saved += mine[: len(mine) - number]
             lost += mine[len(mine) - number :]
@@ -452,54 +417,6 @@ class FileWriter:
         self.written += len(saved)
         for dropped in lost:
             self.count_drop(dropped.key, FAILED)
-
-    def _close_after_failure(
-        self, name: FileName, opened: _Open, failure: str, event: Message, *, is_failed: bool
-    ) -> int | None:
-        """Close a file with an event; return its lost messages, None if unknown."""
-        counts = {"dropped": self._drops.of(*name) - opened.dropped_before}
-        try:
-            if is_failed:
-                return opened.file.fail(failure, counts, [event])
-            opened.file.sync()
-        except OSError as error:
-            _log.error("%s: %s", opened.file.path, error.strerror)
-            return opened.file.fail(failure, counts, [event])
-        try:
-            opened.file.write(event)
-            opened.file.finish(failure, counts)
-        except OSError as error:  # everything except event and END is safe
-            _log.error("%s: %s", opened.file.path, error.strerror)
-            opened.file.fail(failure, counts, [event])
-        return 0
-
-
-def _synced(name: FileName, opened: _Open) -> Misplaced | None:
-    with _failing(name):
-        opened.file.sync()
-        return opened.file.displacement()
-
-
-class _WriteFailed(Exception):  # noqa: N818  # says what happened, as OSError does not
-    def __init__(self, name: FileName | None, reason: str, kind: EventKind) -> None:
-        super().__init__(reason)
-        self.name = name
-        self.reason = reason
-        self.kind = kind
-
-
-@contextlib.contextmanager
-def _failing(name: FileName) -> Iterator[None]:
-    """Add the name of the file to errors."""
-    try:
-        yield
-    except (OSError, InputError) as error:
-        raise _failed(name, error) from error
-
-
-def _failed(name: FileName, error: OSError | InputError) -> _WriteFailed:
-    reason = getattr(error, "strerror", None) or str(error)
-    return _WriteFailed(name, reason, EventKind.WRITE_ERROR)
 
 
 def count_all(intake: Counter[str], writer: FileWriter) -> dict[str, int]:

@@ -340,10 +340,10 @@ def test_low_space_is_reported_and_ends_recording_early(
     for message in sent[:10]:
         writer.put(message)
     wait_for(lambda: writer.written == 10)
-    assert not writer.is_disk_low
+    assert not writer.room.is_low
     room = 700_000
     wait_for(lambda: writer.said)
-    assert writer.is_disk_low
+    assert writer.room.is_low
     for message in sent[10:]:
         writer.put(message)
     wait_for(lambda: writer.written == 21)  # with the event
