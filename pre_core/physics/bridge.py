@@ -136,9 +136,15 @@ def _assemble(blocks: list[FloatArray], held: tuple[int, ...]) -> FloatArray:
     dofs = element_dofs(len(blocks), held)
     total = np.zeros((int(dofs.max()) + 1, int(dofs.max()) + 1))
     for block, dof in zip(blocks, dofs, strict=True):
-        kept = dof >= 0
-        total[np.ix_(dof[kept], dof[kept])] += block[np.ix_(kept, kept)]
+        _add_block(total, block, dof)
     return total
+
+
+def _add_block(total: FloatArray, block: FloatArray, dof: NDArray[np.int64]) -> None:
+    """Add the block (4, 4) of an element to a matrix (d, d) at the free ones of `dof` (4,)."""
+    kept = np.flatnonzero(dof >= 0)
+    free = dof[kept]
+    total[free[:, None], free] += block[kept[:, None], kept]
 
 
 def mass_matrix(beam: Beam, coupling_sign: float = 1.0) -> FloatArray:
@@ -164,10 +170,8 @@ def unit_stiffness_matrices(element_lengths_m: FloatArray, held: tuple[int, ...]
     nodes = node_dofs(n, held)
     size = int(nodes.max()) + 1
     units = np.zeros((n + 4, size, size))
-    for e in range(n):
-        blocks = [np.zeros((4, 4)) for _ in range(n)]
-        blocks[e] = element_stiffness(element_lengths_m[e])
-        units[e] = _assemble(blocks, held)
+    for unit, length_m, dof in zip(units, element_lengths_m, element_dofs(n, held), strict=False):
+        _add_block(unit, element_stiffness(length_m), dof)
     for end, node in enumerate((0, n)):
         deflection, rotation = nodes[node]
         units[n + end, rotation, rotation] = 1.0

@@ -122,17 +122,20 @@ def resample(samples: FloatArray, rate_hz: float, new_rate_hz: float, delay_s: f
         half_length = max(_SMALLEST_HALF_LENGTH, int(np.ceil(taps / 2.0)))
     beta = kaiser_beta(_STOP_BAND_DB)
     offsets = np.arange(1 - half_length, half_length + 1)
+    before = int(np.floor(position[0])) + 1 - half_length
+    behind = int(np.floor(position[-1])) + half_length
+    constant = samples[np.clip(np.arange(before, behind + 1), 0, samples.size - 1)]
+    around = np.lib.stride_tricks.sliding_window_view(constant, offsets.size)
     result = np.empty(count)
     for begin in range(0, count, _BLOCK):
         wanted = position[begin : begin + _BLOCK]
         first = np.floor(wanted).astype(np.int64)
-        index = first[:, None] + offsets
         # At most rates the samples have few different phases between the input samples.
         place, which = np.unique(np.round(wanted - first, 9), return_inverse=True)
         distance = offsets - place[:, None]
         weight = windowed_sinc(distance, cutoff, half_length, beta)
         weight /= weight.sum(axis=1, keepdims=True)  # preserve a constant
-        values = samples[np.clip(index, 0, samples.size - 1)]
+        values = around[first + (1 - half_length - before)]  # rows at once: a copy of each
         result[begin : begin + _BLOCK] = np.einsum("mj,mj->m", weight[which], values)
     return result
 

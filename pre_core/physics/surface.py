@@ -23,6 +23,7 @@ ComplexArray = NDArray[np.complex128]
 
 _WIDEST_CYCLES_PER_M = 40.0
 """Largest lateral wave number; tyres average shorter waves out."""
+_AT_ONCE = 32  # waves along whose amplitudes are drawn at once
 _ACROSS, _FINE = 400, 4000
 """Number of lateral waves: of a drawn surface, and of the integral to one side."""
 _SHORTEST_WAVE_M, _LONGEST_WAVE_M = 0.05, 100.0
@@ -178,13 +179,17 @@ def random_surface(
     longest = np.arcsinh(_WIDEST_CYCLES_PER_M / _SCALE)
     edges = _SCALE * np.sinh(np.linspace(-longest, longest, _ACROSS + 1))
     n_y = 0.5 * (edges[1:] + edges[:-1])
-    # Exact integral of the density over each strip of n_y: that of k^-3 is n_y/(n_x^2 k).
-    power = np.diff(edges / np.hypot(n_x[:, None], edges), axis=1)
-    power *= surface_density(road_class) * step / n_x[:, None] ** 2
-    # In place: for half a kilometre these are a hundred megabytes each.
-    amplitude = np.empty(power.shape, dtype=np.complex128)
-    rng.standard_normal(out=amplitude.view(np.float64))
-    amplitude *= np.sqrt(power, out=power)
+    density = surface_density(road_class) * step
+    # For half a kilometre these are a hundred megabytes: a few waves at a time stay in the cache.
+    amplitude = np.empty((n_x.size, n_y.size), dtype=np.complex128)
+    for begin in range(0, n_x.size, _AT_ONCE):
+        some = slice(begin, begin + _AT_ONCE)
+        along = n_x[some, None]
+        # Exact integral of the density over each strip of n_y: that of k^-3 is n_y/(n_x^2 k).
+        power = np.diff(edges / np.hypot(along, edges), axis=1)
+        power *= density / along**2
+        rng.standard_normal(out=amplitude[some].view(np.float64))
+        amplitude[some] *= np.sqrt(power, out=power)
     return Surface(start_m, spacing_m, count, n_x, n_y, amplitude)
 
 
