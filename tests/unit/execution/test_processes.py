@@ -1,7 +1,5 @@
 """Crossings in processes of their own: the same results, whatever becomes of a process."""
 
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -10,19 +8,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from schemas.results import BridgeResult, CrossingResult
-from schemas.settings import IdentificationSettings
 from services.common.errors import FailureError
 from services.execution.dispatch import TaskResult
 from services.execution.hang_watchdog import TaskLimits
 from services.execution.processes import BackgroundResult, BackgroundTask, ProcessExecutor
-from services.finding.crossing_data import CrossingData
 from services.identification.bridge_state import (
     NOTHING_STORED,
-    Fusing,
     RecentCrossings,
     add_crossings,
     state_of,
@@ -30,6 +24,29 @@ from services.identification.bridge_state import (
 )
 from services.identification.engine import Engine
 from services.identification.outputs import FusionTask, IdentificationTask
+from tests.identifications import Identifications
+from tests.unit.execution.in_processes import (
+    after_a_signal,
+    bad,
+    broken,
+    busy,
+    deadly,
+    deadly_once,
+    die,
+    dies,
+    dies_once,
+    for_ever,
+    hung_once,
+    named_by_number,
+    no_answer,
+    nothing,
+    quick,
+    sleep_at_the_second_start,
+    sleep_for_ever,
+    slow,
+    two_of,
+    wait_for,
+)
 from tests.unit.identification.test_engine_resume import (
     HEADER,
     SETTINGS,
@@ -37,66 +54,11 @@ from tests.unit.identification.test_engine_resume import (
     THERE_AND_BACK,
     TWO,
     WHOLE,
-    Identifications,
     messages_of,
 )
 from tests.unit.identification.test_fusing import crossing
 from tests.waiting import LONGEST_S, until
 from tests.working_engine import feed_all
-
-
-def nothing() -> None:
-    """These searches have no kernels."""
-
-
-def quick(data: CrossingData, settings: IdentificationSettings, **others: Any) -> CrossingResult:
-    others["report"]("half", 0.5)
-    return Identifications()(data, settings, stopwatch=others["stopwatch"])
-
-
-def deadly(data: CrossingData, settings: IdentificationSettings, **others: Any) -> CrossingResult:
-    """The way back kills its process, always."""
-    if data.stay.direction < 0:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return quick(data, settings, **others)
-
-
-def deadly_once(
-    data: CrossingData, settings: IdentificationSettings, **others: Any
-) -> CrossingResult:
-    """Each crossing kills the first process that tries it."""
-    mark = Path(os.environ["DEADLY_ONCE"]) / data.crossing_id
-    if not mark.exists():
-        mark.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return quick(data, settings, **others)
-
-
-def broken(data: CrossingData, settings: IdentificationSettings, **others: Any) -> CrossingResult:
-    raise np.linalg.LinAlgError("singular")
-
-
-def slow(data: CrossingData, settings: IdentificationSettings, **others: Any) -> CrossingResult:
-    """For ever."""
-    while True:
-        time.sleep(1.0)
-
-
-def busy(data: CrossingData, settings: IdentificationSettings, **others: Any) -> CrossingResult:
-    """For ever, and with all of a processor; the way there only."""
-    while data.stay.direction > 0:
-        pass
-    return quick(data, settings, **others)
-
-
-def busy_once(
-    data: CrossingData, settings: IdentificationSettings, **others: Any
-) -> CrossingResult:
-    mark = Path(os.environ["DEADLY_ONCE"]) / data.crossing_id
-    while mark.exists():
-        return quick(data, settings, **others)
-    mark.touch()
-    return busy(data, settings, **others)
 
 
 def works() -> list[IdentificationTask]:
@@ -175,7 +137,7 @@ def test_a_process_that_dies_once_costs_nothing(
     ("search", "limits", "why"),
     [
         (slow, TaskLimits(idle_s=1.0), "has done nothing for 1 s"),
-        (busy, TaskLimits(processor_s=4.0), "has taken more than 4 s of processor time"),
+        (busy, TaskLimits(processor_s=2.0), "has taken more than 2 s of processor time"),
     ],
 )
 def test_a_hung_process_is_ended_and_its_crossing_fails_at_the_second_time(
@@ -208,8 +170,8 @@ def test_a_process_that_is_hung_once_costs_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DEADLY_ONCE", str(tmp_path))
-    limits = TaskLimits(processor_s=4.0)
-    with ProcessExecutor(1, identify=busy_once, prepare=nothing, limits=limits) as processes:
+    limits = TaskLimits(idle_s=1.0)
+    with ProcessExecutor(1, identify=hung_once, prepare=nothing, limits=limits) as processes:
         processes.submit(works()[0])
         (finished,) = all_of(processes)
     assert finished.result.verdict == "good"
@@ -236,27 +198,12 @@ def test_an_error_in_a_process_is_a_verdict(caplog: pytest.LogCaptureFixture) ->
     assert "singular" in caplog.text
 
 
-def die() -> None:
-    os._exit(3)
-
-
 def test_a_process_that_cannot_begin_is_a_failure() -> None:
     with (
         ProcessExecutor(1, identify=quick, prepare=die) as processes,
         pytest.raises(FailureError, match="died while it was started"),
     ):
         processes.wait_until_warm()
-
-
-def sleep_for_ever() -> None:
-    time.sleep(1e6)
-
-
-def sleep_at_the_second_start() -> None:
-    starts = Path(os.environ["DEADLY_ONCE"])
-    (starts / f"start {len(list(starts.iterdir()))}").touch()
-    if len(list(starts.iterdir())) == 3:  # a mark of the crossing that killed the first is there
-        sleep_for_ever()
 
 
 def test_a_process_that_hangs_while_it_is_started_is_ended(
@@ -308,7 +255,8 @@ def test_more_than_a_few_wait_elsewhere() -> None:
 STARTER = """
 import os, signal, sys, time
 from services.execution.processes import ProcessExecutor
-from tests.unit.execution.test_processes import nothing, slow, works
+from tests.unit.execution.in_processes import nothing, slow
+from tests.unit.execution.test_processes import works
 processes = ProcessExecutor(1, identify=slow, prepare=nothing)
 processes.wait_until_warm()
 processes.submit(works()[0])
@@ -369,45 +317,8 @@ def test_results_may_come_back_in_any_order() -> None:
 # Crossings that are fused
 
 
-STATE = BridgeResult(verdict="rejected")  # type: ignore[call-arg]
-
-
 def fuse_of(number: int, bridge: str = "bridge-1") -> FusionTask:
     return FusionTask("live", bridge, RecentCrossings((), number), NOTHING_STORED, 1.0 * number)
-
-
-def named_by_number(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
-    """Record which process made it of what, and when."""
-    (Path(os.environ["DEADLY_ONCE"]) / f"{time.monotonic_ns()} {bridge} {counted.number}").touch()
-    return STATE.model_copy(update={"crossings_left_out_count": counted.number})
-
-
-def after_a_signal(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
-    state = named_by_number(counted, bridge, fusing)
-    wait_for(str(Path(os.environ["DEADLY_ONCE"]) / "go on"))
-    return state
-
-
-def dies(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
-    os.kill(os.getpid(), signal.SIGKILL)
-    raise AssertionError
-
-
-def dies_once(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
-    mark = Path(os.environ["DEADLY_ONCE"]) / "died"
-    if not mark.exists():
-        mark.touch()
-        dies(counted, bridge, fusing)
-    return named_by_number(counted, bridge, fusing)
-
-
-def for_ever(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
-    time.sleep(1e6)
-    raise AssertionError
-
-
-def bad(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
-    raise np.linalg.LinAlgError("singular")
 
 
 @pytest.fixture
@@ -521,14 +432,6 @@ def test_numbers_of_a_state_are_those_of_this_process() -> None:
 # What is computed aside
 
 
-def two_of(number: int) -> int:
-    return 2 * number
-
-
-def no_answer() -> None:
-    raise np.linalg.LinAlgError("singular")
-
-
 def until_over(processes: ProcessExecutor, number: int) -> list[BackgroundResult]:
     found: list[BackgroundResult] = []
     deadline = time.monotonic() + LONGEST_S
@@ -562,13 +465,6 @@ def test_what_cannot_be_computed_aside_costs_nothing_else(run: Callable[[], None
         processes.submit(work)
         (finished,) = all_of(processes)
     assert finished.result.verdict == "good"
-
-
-def wait_for(path: str) -> str:
-    deadline = time.monotonic() + LONGEST_S
-    while not Path(path).exists() and time.monotonic() < deadline:
-        time.sleep(0.01)
-    return path
 
 
 def test_a_crossing_comes_before_whatever_waits_aside(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from services.identification.engine import Engine
 from services.identification.known import CrossingRecord, search_hash
 from services.identification.outputs import IdentificationTask, Output, ValidationRequest
 from services.ledger.crossing_log import known_crossings
+from tests.identifications import Identifications
 from tests.unit.identification.test_engine_resume import (
     HEADER,
     SETTINGS,
@@ -23,7 +24,6 @@ from tests.unit.identification.test_engine_resume import (
     TWO,
     WHOLE,
     EngineOutput,
-    Identifications,
     messages_of,
     said_by,
 )

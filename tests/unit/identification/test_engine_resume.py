@@ -1,13 +1,12 @@
 """A run of the worker's deciding part that goes on from what earlier runs said."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import BridgeResult, CrossingResult, ResultHeader
+from schemas.results import BridgeResult, ResultHeader
 from schemas.results_on_the_wire import crossing_to_protobuf, state_to_bridge
 from schemas.settings import IdentificationSettings
 from schemas.signals import decode_accel, encode_accel
@@ -16,10 +15,8 @@ from schemas.topics import Key, Message
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.execution.inline import InlineExecutor
-from services.finding.crossing_data import CrossingData
 from services.identification.bridge_state import state_of
 from services.identification.engine import Engine
-from services.identification.identify import Stopwatch
 from services.identification.known import search_hash
 from services.identification.outputs import (
     FusionTask,
@@ -27,9 +24,9 @@ from services.identification.outputs import (
     Output,
     ValidationRequest,
 )
-from services.identification.result_parts import CrossingTimes, rejected
 from services.ledger.crossing_log import known_crossings
 from services.simulation.drive import paper_site
+from tests.identifications import Identifications
 from tests.working_engine import WorkingEngine
 
 REALM = "sim-test"
@@ -38,37 +35,6 @@ SITE = paper_site()
 SETTINGS = IdentificationSettings(method="least_squares")
 HEADER = ResultHeader("0", 0.0, site_hash(SITE), SETTINGS.model_dump(mode="json"), SETTINGS.seed)
 EngineOutput = list[tuple[Key, bytes]]
-
-
-@dataclass
-class Identifications:
-    """A search that knows its answer at once, and counts."""
-
-    made: int = 0
-
-    def __call__(
-        self,
-        data: CrossingData,
-        settings: IdentificationSettings,
-        *,
-        stopwatch: Stopwatch,
-        report: object = None,
-        keep: object = None,
-    ) -> CrossingResult:
-        self.made += 1
-        stay = data.stay
-        passing = CrossingTimes(stay.entry_s, stay.exit_s, 10.0)
-        whole = data.samples is not None and not any(
-            channel.size == 0 or np.isnan(channel).any()
-            for channel in data.samples.channels.values()
-        )
-        if not whole:
-            return rejected(data, settings, passing, ["gap_on_bridge"])  # type: ignore[list-item]
-        one = {"unit": "N·m²", "mean": 1.0, "std": 0.1, "q025": 0.8, "q50": 1.0, "q975": 1.2}
-        return CrossingResult.model_validate(
-            rejected(data, settings, passing, ["failed"]).model_dump()  # type: ignore[list-item]
-            | {"verdict": "good", "reasons": (), "reason_texts": (), "parameters": {"EI_1": one}}
-        )
 
 
 def engine(counted: Identifications | None = None, header: ResultHeader = HEADER) -> WorkingEngine:

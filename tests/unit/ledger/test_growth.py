@@ -28,10 +28,10 @@ from services.ledger.crossing_log import CrossingLog
 from services.ledger.growing_json import AppendableResults
 from services.ledger.runs import ResultFiles
 from services.simulation.drive import paper_site
+from tests.identifications import Identifications
 from tests.unit.identification.test_engine_resume import HEADER as ENGINE_HEADER
 from tests.unit.identification.test_engine_resume import (
     SETTINGS,
-    Identifications,
     fed,
     messages_of,
 )

@@ -16,7 +16,8 @@ from services.ledger.crossing_log import known_crossings
 from services.ledger.processed import is_processed
 from services.recordings.writer import write_recording
 from services.simulation.drive import paper_site
-from tests.unit.identification.test_engine_resume import Identifications, messages_of
+from tests.identifications import Identifications
+from tests.unit.identification.test_engine_resume import messages_of
 from tests.working_engine import WorkingEngine
 
 REALM = "sim-test"

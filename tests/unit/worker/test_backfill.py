@@ -21,6 +21,7 @@ from services.ledger.crossing_log import Ledger, known_crossings
 from services.recordings.writer import RecordingWriter
 from services.worker.backfill import Backfill
 from services.worker.recording_list import BackfillSource
+from tests.identifications import Identifications
 from tests.unit.identification.test_engine_resume import (
     HEADER,
     REALM,
@@ -30,7 +31,6 @@ from tests.unit.identification.test_engine_resume import (
     TWO,
     WHOLE,
     EngineOutput,
-    Identifications,
     said_by,
 )
 
