@@ -83,21 +83,38 @@ def recorded(tmp_path_factory: pytest.TempPathFactory, site: Site) -> Path:
 
 
 @pytest.fixture
-def fleet(tmp_path: Path, recorded: Path) -> Path:
-    """A copy of the recordings."""
+def long(tmp_path: Path, recorded: Path) -> Path:
+    """A copy of these recordings."""
     return shutil.copytree(recorded, tmp_path / "fleet")
 
 
 @pytest.fixture(scope="module")
-def catalogued(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The recordings with their catalogue."""
-    folder = shutil.copytree(recorded, tmp_path_factory.mktemp("catalogued") / "fleet")
+def short(tmp_path_factory: pytest.TempPathFactory, site: Site) -> Path:
+    """Three recordings of half a minute, each of one crossing: for what is not about the drive."""
+    folder = tmp_path_factory.mktemp("short")
+    for name, middle_s, boot in (("a", 100, 7), ("b", 400, 7), ("c", 4100, 8)):
+        seconds = range(middle_s - 15, middle_s + 15)
+        path = folder / f"live/2023-11-14/{name}.mcap"
+        record(path, drive(site, seconds, (middle_s,), boot))
+    return folder
+
+
+@pytest.fixture
+def fleet(tmp_path: Path, short: Path) -> Path:
+    """A copy of the short recordings."""
+    return shutil.copytree(short, tmp_path / "fleet")
+
+
+@pytest.fixture(scope="module")
+def catalogued(short: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The short recordings with their catalogue."""
+    folder = shutil.copytree(short, tmp_path_factory.mktemp("catalogued") / "fleet")
     update_catalog(folder_at(str(folder)))
     return folder
 
 
-def test_a_row_says_what_is_in_a_recording(fleet: Path) -> None:
-    rows = update_catalog(folder_at(str(fleet))).rows
+def test_a_row_says_what_is_in_a_recording(long: Path) -> None:
+    rows = update_catalog(folder_at(str(long))).rows
     assert list(rows) == [f"live/2023-11-14/{name}.mcap" for name in "abc"]
     row = rows["live/2023-11-14/a.mcap"]
     assert (row.vehicles, row.realms) == (("truck-1",), ("live",))
@@ -116,8 +133,8 @@ def test_a_gap_is_counted(tmp_path: Path, site: Site) -> None:
     assert (row.gaps, row.gap_s) == (2, pytest.approx(8.2))  # of two streams
 
 
-def test_crossings_from_positions_alone(fleet: Path, site: Site) -> None:
-    folder = folder_at(str(fleet))
+def test_crossings_from_positions_alone(long: Path, site: Site) -> None:
+    folder = folder_at(str(long))
     found = crossings_of(folder, update_catalog(folder).rows.values(), site)
     assert found.problems == ()
     assert [c.passage for c in found.crossings] == [Passage.THROUGH] * 3
@@ -125,7 +142,7 @@ def test_crossings_from_positions_alone(fleet: Path, site: Site) -> None:
     alone = [
         p
         for n in "ab"
-        for p in summarise_recording(fleet / f"live/2023-11-14/{n}.mcap", site).passings
+        for p in summarise_recording(long / f"live/2023-11-14/{n}.mcap", site).passings
     ]
     through = [p for p in alone if p.passage is Passage.THROUGH]
     assert len(through) == 2
