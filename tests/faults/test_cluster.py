@@ -33,8 +33,8 @@ from tests.waiting import until
 
 pytestmark = pytest.mark.process
 
-CROSSINGS = 20
-HELD = "20260101T014003"
+CROSSINGS = 12
+HELD = "20260101T010003"
 """When the first crossing begins that workers can be made to hold, as all later ones."""
 _HOLDING = """
 import time
@@ -160,7 +160,7 @@ def in_the_middle(running: Running, into: Path) -> None:
 
 
 def on(two: RunningCluster, into: Path, *options: str) -> list[str]:
-    return ["--scheduler", two.address, "--into", str(into), "--batch", "5", *options]
+    return ["--scheduler", two.address, "--into", str(into), "--batch", "3", *options]
 
 
 def test_a_drive_gives_what_it_gives_in_one_process(
