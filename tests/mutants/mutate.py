@@ -10,6 +10,7 @@ import io
 import tokenize
 from bisect import bisect_left
 from collections.abc import Iterator
+from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -38,7 +39,8 @@ class Mutant(NamedTuple):
         return "".join(lines)
 
 
-def mutants(source: str) -> list[Mutant]:
+@cache
+def mutants(source: str) -> tuple[Mutant, ...]:
     """Every mutant of a file, in the order of their places."""
     lines = source.splitlines(keepends=True)
     tokens = [
@@ -97,7 +99,7 @@ def mutants(source: str) -> list[Mutant]:
                 begin = place(value.end_lineno, value.end_col_offset)
                 yield from between(begin, (begin[0] + 1, 0), name, NAMES[name])
 
-    return sorted({mutant for node in _walk(ast.parse(source)) for mutant in of(node)})
+    return tuple(sorted({mutant for node in _walk(ast.parse(source)) for mutant in of(node)}))
 
 
 def _walk(node: ast.AST) -> Iterator[ast.AST]:

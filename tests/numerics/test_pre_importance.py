@@ -242,7 +242,7 @@ ACCEPTED = pytest.mark.xfail(
 )
 
 
-@pytest.mark.parametrize("degrees", [0.5, pytest.param(1.0, marks=ACCEPTED)])
+@pytest.mark.parametrize("degrees", [0.5, pytest.param(1.0, marks=[ACCEPTED, pytest.mark.slow])])
 def test_weighted_draws_give_up_where_tails_are_heavy(degrees: float) -> None:
     """Student's t in each of twenty coordinates; a posterior has normal priors, no such tails."""
 

@@ -130,9 +130,7 @@ def check_on_two_roads(found: Judged) -> None:
     assert evaluations < MAX_EVALUATIONS
 
 
-RUNS_OF_D8 = [
-    pytest.param(run, marks=() if run in (3, 8) else pytest.mark.slow) for run in range(12)
-]
+RUNS_OF_D8 = [pytest.param(run, marks=() if run == 3 else pytest.mark.slow) for run in range(12)]
 
 
 @pytest.mark.parametrize("run", RUNS_OF_D8)

@@ -65,7 +65,7 @@ def test_changed_gain_is_named(factor: float) -> None:
     assert U1 in result.reason_texts[result.reasons.index(Reason.GAIN_CHANGED)]
 
 
-@pytest.mark.parametrize("rate_hz", [200.0, 1000.0])
+@pytest.mark.parametrize("rate_hz", [pytest.param(200.0, marks=pytest.mark.slow), 1000.0])
 def test_sound_channels_show_no_step(rate_hz: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Below the threshold by a factor of 1.5 and more."""
     seen: list[Fit] = []
