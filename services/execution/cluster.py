@@ -26,6 +26,7 @@ from services.execution.inline import InlineExecutor
 from services.execution.program import program
 from services.execution.scheduler import (
     Credentials,
+    Scheduler,
     SchedulerUnavailableError,
     check_address,
     connect,
@@ -145,7 +146,7 @@ class DaskExecutor:
         """
         if timeout_s > 0.0 and not self.is_full:
             self._send(is_all=True)
-        self._wait(timeout_s)
+        _wait_for_any([sent.future for sent in self._submitted.values()], timeout_s)
         self._collect_all()
         self._check_scheduler()
         self._send()
@@ -182,27 +183,9 @@ class DaskExecutor:
         return not suspect and len(self._submitted) < self._window
 
     def _connect(self, longest_s: float) -> None:
-        """Wait for a scheduler with workers of this program, also if it is lost meanwhile."""
-        deadline = time.monotonic() + self._patience_s
-        is_logged = False
-        while True:
-            self._scheduler = connect(self._address, self._credentials, longest_s)
-            try:
-                self._scheduler.wait_for_workers(self._patience_s)
-                self._scheduler.check_workers(self._program)
-                break
-            except SchedulerUnavailableError as error:
-                self.close()
-                longest_s = deadline - time.monotonic()
-                if longest_s <= 0.0:
-                    raise
-                if not is_logged:
-                    is_logged = True
-                    _log.warning("%s; retrying for %.0f s", error, longest_s)
-                time.sleep(_RETRY_S)
-            except BaseException:
-                self.close()
-                raise
+        self._scheduler = _scheduler_with_workers(
+            self._address, self._credentials, self._program, longest_s, self._patience_s
+        )
         self._asked_s = self._with_workers_s = time.monotonic()
         self._workers = self._scheduler.threads or 1
 
@@ -232,13 +215,6 @@ class DaskExecutor:
         self._submitted[batch.content] = _SubmittedBatch(
             batch, self._scheduler.submit(key, works, self._program)
         )
-
-    def _wait(self, timeout_s: float) -> None:
-        deadline = time.monotonic() + timeout_s
-        while self._submitted and time.monotonic() < deadline:
-            if any(sent.future.status != "pending" for sent in self._submitted.values()):
-                return
-            time.sleep(_POLL_S)
 
     def _collect_all(self) -> None:
         """Collect the results of finished tasks, up to one that does not arrive.
@@ -342,3 +318,42 @@ class DaskExecutor:
 
 def _with_one_thread(work: IdentificationTask) -> IdentificationTask:
     return work._replace(settings=work.settings.model_copy(update={"threads": 1}))
+
+
+def _scheduler_with_workers(
+    address: str,
+    credentials: Credentials | None,
+    program: dict[str, str],
+    longest_s: float,
+    patience_s: float,
+) -> Scheduler:
+    """Wait for a scheduler with workers of this program, also if it is lost meanwhile."""
+    deadline = time.monotonic() + patience_s
+    is_logged = False
+    while True:
+        scheduler = connect(address, credentials, longest_s)
+        try:
+            scheduler.wait_for_workers(patience_s)
+            scheduler.check_workers(program)
+            return scheduler
+        except SchedulerUnavailableError as error:
+            scheduler.close()
+            longest_s = deadline - time.monotonic()
+            if longest_s <= 0.0:
+                raise
+            if not is_logged:
+                is_logged = True
+                _log.warning("%s; retrying for %.0f s", error, longest_s)
+            time.sleep(_RETRY_S)
+        except BaseException:
+            scheduler.close()
+            raise
+
+
+def _wait_for_any(futures: Sequence[Any], timeout_s: float) -> None:
+    """Wait until one of some tasks is no longer pending."""
+    deadline = time.monotonic() + timeout_s
+    while futures and time.monotonic() < deadline:
+        if any(future.status != "pending" for future in futures):
+            return
+        time.sleep(_POLL_S)

@@ -34,7 +34,6 @@ LONG_MODULES = {
 }
 
 LONG_CLASSES = {
-    "services.execution.cluster:DaskExecutor": 273,
     "services.logger.writer:FileWriter": 349,
 }
 
