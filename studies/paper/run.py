@@ -52,11 +52,8 @@ def _run_scenarios(asked: ScenarioOptions, console: "Console") -> list[Scenario]
                 number,
                 car,
                 sound,
-                noise_ug_per_rthz=asked.noise,
-                seed=asked.seed,
-                particles=asked.particles,
-                steps=asked.steps,
-                progress=lambda text, steps: progress.update(task, description=text, advance=steps),
+                asked,
+                lambda text, steps: progress.update(task, description=text, advance=steps),
             )
             for number in asked.scenarios
         ]

@@ -25,6 +25,7 @@ from pre_core.search import loop
 from schemas.site_file import load_site
 from services.common.errors import FailureError, InputError
 from services.simulation.drive import beam_of, truck_of
+from services.simulation.validation_options import ScenarioOptions
 from studies.paper.tables import of_paper
 
 Floats = NDArray[np.float64]
@@ -72,11 +73,7 @@ def run_scenario(
     number: int,
     car: HalfCar,
     sound: Beam,
-    *,
-    noise_ug_per_rthz: float,
-    seed: int,
-    particles: int,
-    steps: int,
+    asked: ScenarioOptions,
     progress: Callable[[str, int], None] = lambda text, steps: None,
 ) -> Scenario:
     """Simulate one scenario and search for its parameters in both ways.
@@ -90,7 +87,7 @@ def run_scenario(
     ratios = experiment.scenario_ratios(number)
     damaged = sound._replace(flexural_rigidity_nm2=sound.flexural_rigidity_nm2 * ratios)
     try:
-        window = paper_window(car, damaged, noise_ug_per_rthz, seed)
+        window = paper_window(car, damaged, asked.noise, asked.seed)
     except ArithmeticError as error:
         raise FailureError(f"{error}: are the site's values possible?") from error
     nominal = from_models(car, sound)
@@ -101,27 +98,21 @@ def run_scenario(
     true_ratio |= {f"EI_{e + 1}": float(ratio) for e, ratio in enumerate(ratios)}
 
     began = time.perf_counter()
-    walk = random_walk.problem(window, nominal, free, seed)
-    first = random_walk.init(walk, particles)
+    walk = random_walk.problem(window, nominal, free, asked.seed)
+    first = random_walk.init(walk, asked.particles)
     last, _, walk_ending = loop.run_search(
         lambda: first,
         partial(random_walk.step, walk),
-        steps,
+        asked.steps,
         at_the_end=loop.Termination.STEPS_DONE,
         progress=lambda count, info: advance("random walk", 1),
     )
     walked = time.perf_counter()
     advance("least squares", 0)
-    problem = least_squares.LeastSquaresProblem(window, nominal, free)
-    start = np.random.default_rng(np.random.SeedSequence([seed, number])).uniform(
+    start = np.random.default_rng(np.random.SeedSequence([asked.seed, number])).uniform(
         random_walk.PRIOR_LOW, random_walk.PRIOR_HIGH, free.size
     )
-    work = residual.workspace(window)
-    best, _, fit_ending = loop.run_search(
-        partial(least_squares.init, problem, work, nominal[free] * start),
-        partial(least_squares.step, problem, work),
-        least_squares.MAX_STEPS,
-    )
+    theta, fit_ending = _least_squares(window, nominal, free, nominal[free] * start)
     fitted = time.perf_counter()
     advance("least squares", 1)
     columns = partial(table_columns, nominal=nominal, free=free, window=window)
@@ -131,14 +122,24 @@ def run_scenario(
         true_ratio,
         columns(first.ratios),
         cloud_of(columns(last.ratios), names, true_ratio),
-        cloud_of(
-            columns(least_squares.untransform(problem, best.y)[None, :] / nominal[free]),
-            names,
-            true_ratio,
-        ),
+        cloud_of(columns(theta[None, :] / nominal[free]), names, true_ratio),
         {"random_walk": walk_ending, "least_squares": fit_ending},
         {"random_walk": walked - began, "least_squares": fitted - walked},
     )
+
+
+def _least_squares(
+    window: PaperWindow, nominal: Floats, free: NDArray[np.int64], start: Floats
+) -> tuple[Floats, loop.Termination]:
+    """Return the estimate of the free parameters (f,) from a start (f,), and how it ended."""
+    problem = least_squares.LeastSquaresProblem(window, nominal, free)
+    work = residual.workspace(window)
+    best, _, ending = loop.run_search(
+        partial(least_squares.init, problem, work, start),
+        partial(least_squares.step, problem, work),
+        least_squares.MAX_STEPS,
+    )
+    return least_squares.untransform(problem, best.y), ending
 
 
 def models(site: Path | None) -> tuple[HalfCar, Beam]:

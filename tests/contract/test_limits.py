@@ -46,7 +46,6 @@ LONG_FUNCTIONS = {
     "services.identification.pre_method:identify_pre": 77,
     "services.simulation.wide_cases:draw_wide": 78,
     "services.simulation.out_of_model:draw_out_of_model": 78,
-    "studies.paper.scenarios:run_scenario": 71,
 }
 
 MANY_ARGUMENTS = {
@@ -62,7 +61,6 @@ MANY_ARGUMENTS = {
     "services.simulation.drive:simulate_drive": 12,
     "services.simulation.two_sided_surface:_heights": 9,
     "services.simulation.wide_crossings:road_under": 8,
-    "studies.paper.scenarios:run_scenario": 8,
 }
 
 ROOMS_WITH_CODE = {

@@ -34,15 +34,17 @@ SOUND = experiment.beam(np.ones(experiment.ELEMENTS))
 def run(
     scenario: int, *, particles: int = 500, steps: int = 600, noise: float = 0.0, seed: int = 0
 ) -> Scenario:
-    return run_scenario(
-        scenario,
-        experiment.TRUCK,
-        SOUND,
-        noise_ug_per_rthz=noise,
+    asked = ScenarioOptions(
+        scenarios=(scenario,),
+        noise=noise,
         seed=seed,
+        site=None,
         particles=particles,
         steps=steps,
+        json=None,
+        figures=None,
     )
+    return run_scenario(scenario, experiment.TRUCK, SOUND, asked)
 
 
 def command(
