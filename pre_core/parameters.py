@@ -2,7 +2,7 @@
 
 A parameter vector theta has the rows of the truck first, then those of the bridge, then EI of every
 element. To add a parameter, add a row here and its effect in `physics` (and the sensor noise that
-it transmits, `crossing/whitening`); priors, search, results and validation follow from the row.
+it transmits, `crossing/noise`); priors, search, results and validation follow from the row.
 """
 
 from functools import cache
@@ -20,7 +20,7 @@ class ParameterSpec(NamedTuple):
     """A row of the table. The prior is log-normal about the nominal value unless that is zero."""
 
     name: str
-    """Name in results (docs/contract.md, "Parameter names")."""
+    """Name in results (docs/contract.md, "Parameters")."""
     unit: str
     part: str
     """Owner of the parameter: TRUCK or BRIDGE."""

@@ -49,9 +49,10 @@ class Alarm(StrictModel):
     def sentence(self) -> str:
         """Return the alarm in words."""
         change = 100.0 * abs(1.0 - self.ratio)
+        how = "less stiff" if self.direction == "weaker" else "stiffer"
         ends = sorted(100.0 * abs(1.0 - end) for end in (self.ratio_q025, self.ratio_q975))
         return (
-            f"element {self.element} is {change:.0f} % {self.direction} than before "
+            f"element {self.element} is {change:.0f} % {how} than before "
             f"{datetime.fromtimestamp(self.since, UTC):%Y-%m-%d}, "
             f"interval {ends[0]:.0f} to {ends[1]:.0f} %"
         )

@@ -77,7 +77,7 @@ class FusionLikelihood(StrictModel):
     level_m3: tuple[Finite, ...]
     """Level of the mismatch spectrum as this crossing estimates it."""
     off_bridge_m: tuple[Stretch, ...] = ()
-    """Mismatch before and behind the bridge."""
+    """Mismatch before and after the bridge."""
     bends: Bends | None = None
 
     @model_validator(mode="after")

@@ -63,7 +63,7 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.POSITION_OUTAGE: "The receiver reported no position while the truck was on the bridge.",
     Reason.NOT_FINITE: "The recording or the fit contains values that are not finite numbers.",
     Reason.SENSOR_SATURATED: "An accelerometer reached the end of its range.",
-    Reason.CHANNEL_SWAPPED: "Two channels seem to be exchanged.",
+    Reason.CHANNEL_SWAPPED: "Two channels seem to be swapped.",
     Reason.CHANNEL_INVERTED: "A channel seems to have the wrong sign.",
     Reason.CHANNEL_STUCK: "A channel repeats one value.",
     Reason.CHANNEL_BRIDGED: "A channel contains a straight line in place of measured samples.",
@@ -110,8 +110,8 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     ),
     Reason.IMPLAUSIBLE_VEHICLE: "The estimated truck parameters contradict the site file.",
     Reason.TANDEM_FRICTION: (
-        "Friction in the springs of the tandem, whose axles do not share their load, hides the "
-        "difference of the deflections under them."
+        "Friction in the springs of the tandem, which has no load equalisation, hides the "
+        "difference of the deflections under its axles."
     ),
     Reason.MORE_AXLES_THAN_DECLARED: (
         "The rear of the truck moves as if pushed by a further axle or a trailer that the site "

@@ -250,7 +250,7 @@ class Bridge(Lane, Damping, WithSpreads):
             (self.end_latitude_deg, self.end_longitude_deg),
         )
         for hint, (start, end) in {
-            "latitude and longitude exchanged": tuple((b, a) for a, b in ends),
+            "latitude and longitude swapped": tuple((b, a) for a, b in ends),
             "in radians": tuple((math.degrees(a), math.degrees(b)) for a, b in ends),
             "the sign of one longitude": (ends[0], (ends[1][0], -ends[1][1])),
         }.items():

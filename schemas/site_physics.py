@@ -165,9 +165,9 @@ def in_tonnes(mass_kg: float) -> str:
 
 def _damping_meant(alpha: float, beta: float, omega: float) -> str:
     """Return a hint what coefficients of damping may be; empty where it is not known."""
-    exchanged = 0.5 * (beta / omega + alpha * omega)
-    if alpha and _USUAL_DAMPING[0] <= exchanged <= _USUAL_DAMPING[1]:
-        return "; exchanged with the other coefficient?"
+    swapped = 0.5 * (beta / omega + alpha * omega)
+    if alpha and _USUAL_DAMPING[0] <= swapped <= _USUAL_DAMPING[1]:
+        return "; swapped with the other coefficient?"
     if beta < 0.2:
         return f"; a damping ratio? then it is {2.0 * beta / omega:.3g} s"
     if beta <= 20.0:

@@ -61,7 +61,7 @@ def tandem_of(axles: Sequence[Axle], bogies: Sequence[Bogie]) -> Tandem:
         if bogies and bogies[0].shares is not None:
             raise error_at(
                 "bogies.0.shares",
-                "are of axles that share their load, remove them or set equalised = true",
+                "are of an equalised tandem, remove them or set equalised = true",
             )
         return Tandem(lead, first, second, *_static_share(first, second), is_equalised=False)
     bogie = bogies[0]
@@ -84,8 +84,8 @@ def _static_share(first: Axle, second: Axle) -> tuple[float, float]:
         if axle.load_kg is None:
             raise error_at(
                 f"axles.{number - 1}.load_kg",
-                "is missing, it must be a mass in kg: axles that do not share their load by an "
-                "equalised bogie are weighed",
+                "is missing, it must be a mass in kg: the axles of a tandem without load "
+                "equalisation are weighed",
             )
         carried.append(axle.load_kg - axle.unsprung_mass_kg)
         if carried[-1] <= 0.0:

@@ -38,7 +38,7 @@ _FRONT_OVER_REAR: Final = (0.15, 2.5)
 _AXLE_OVER_REAR: Final = (0.3, 1.4)
 _LOADS_REVERSED: Final = (2.0, 0.4)
 """Least factor between the loads and what springs, tyres and axles are made for, and the largest
-share of it, in logarithms, that is left with the loads exchanged."""
+share of it, in logarithms, that is left with the loads swapped."""
 _GIVEN_OVER_IMPLIED: Final = (0.6, 1.7)
 """EI by the given first frequency over the nominal one."""
 _RATIO_AS_ALPHA: Final = (0.003, 0.1)
@@ -91,7 +91,7 @@ class Implied(NamedTuple):
     def advice(self) -> str:
         """Sentence that names the usual range, and what was probably meant."""
         most = f" to {self.high:.3g}" if self.high < math.inf else " at least"
-        usual = f"usual is {self.low:.3g}{most} {self.unit}".rstrip()
+        usual = f"typical is {self.low:.3g}{most} {self.unit}".rstrip()
         return f"{usual}: {self.meant}" if self.meant else f"{usual}: check units and values"
 
 
@@ -181,7 +181,7 @@ def of_frequencies(toml_text: str) -> Iterator[Implied]:
 
 
 def _loads(vehicle: Vehicle) -> Iterator[Implied]:
-    """Yield loads that fit springs, tyres and axle masses only if front and rear are exchanged."""
+    """Yield loads that fit springs, tyres and axle masses only if front and rear are swapped."""
     pairs = (
         vehicle.suspension_stiffness_n_per_m,
         vehicle.tyre_stiffness_n_per_m,
@@ -205,22 +205,22 @@ def _loads(vehicle: Vehicle) -> Iterator[Implied]:
 
 
 def _pairs(vehicle: Vehicle, loads: tuple[float, float]) -> Iterator[Implied]:
-    """Yield ratios of a truck's pairs, which show exchanged values."""
-    exchanged = "[front, rear] exchanged?"
+    """Yield ratios of a truck's pairs, which show swapped values."""
+    swapped = "[front, rear] swapped?"
     springs, tyres = vehicle.suspension_stiffness_n_per_m, vehicle.tyre_stiffness_n_per_m
     for key, pair in (("suspension_stiffness", springs), ("tyre_stiffness", tyres)):
         ratio = pair[0] / pair[1] * loads[1] / loads[0]
         text = f"{vehicle.id}: {key} over its load, front over rear, {ratio:.3g}"
         low, high = _FRONT_OVER_REAR
-        yield Implied(key, text, ratio, low, high, "", f"{key}_n_per_m: {exchanged}")
+        yield Implied(key, text, ratio, low, high, "", f"{key}_n_per_m: {swapped}")
     ratio = vehicle.unsprung_mass_kg[0] / vehicle.unsprung_mass_kg[1]
     text = f"{vehicle.id}: front axle over rear axle, masses, {ratio:.3g}"
     low, high = _AXLE_OVER_REAR
-    yield Implied("axle_masses", text, ratio, low, high, "", f"unsprung_mass_kg: {exchanged}")
+    yield Implied("axle_masses", text, ratio, low, high, "", f"unsprung_mass_kg: {swapped}")
     ratio = min(tyre / spring for tyre, spring in zip(tyres, springs, strict=True))
     text = f"{vehicle.id}: tyres over springs, stiffness, {ratio:.3g}"
     low, high = _TYRE_OVER_SPRING
-    meant = "tyre_stiffness_n_per_m and suspension_stiffness_n_per_m exchanged?"
+    meant = "tyre_stiffness_n_per_m and suspension_stiffness_n_per_m swapped?"
     yield Implied("tyres_over_springs", text, ratio, low, high, "", meant if ratio < low else "")
 
 
@@ -238,7 +238,7 @@ def _tyres(vehicle: Vehicle) -> Iterator[Implied]:
     apart = vehicle.twin_tyre_distance_m
     if apart is not None and apart[0] > 0.0 == apart[1]:
         text = f"{vehicle.id}: twin tyres in front, single ones behind"
-        meant = "twin_tyre_distance_m: [front, rear] exchanged?"
+        meant = "twin_tyre_distance_m: [front, rear] swapped?"
         yield Implied("twin_tyres", text, 1.0, 0.0, 0.5, "", meant)
 
 
@@ -355,7 +355,7 @@ def _elements(bridge: Bridge) -> Iterator[Implied]:
     text = f"{bridge.id}: {bridge.elements} elements over {spans} spans: no weak place is located"
     if spans == 1:
         text = f"{bridge.id}: a single element: no weak place is located"
-    meant = f"elements is {bridge.elements}: {probable} are usual here"
+    meant = f"elements is {bridge.elements}: {probable} are typical here"
     value = float(bridge.elements)
     yield Implied("elements", text, value, spans + 1.0, 3.0 * probable, "elements", meant)
 

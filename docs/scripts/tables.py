@@ -18,7 +18,7 @@ from pydantic.fields import FieldInfo
 from pre_core.parameters import DERIVED_UNITS, ELEMENT, SCALARS, TRUCK, ParameterSpec
 from schemas import fusion, results, site, site_axle_tables, site_import, site_ros2, site_sensors
 from schemas.metrics import METRICS
-from schemas.reasons import BRIDGE_REASON_TEXTS, LEFT_OUT_TEXTS
+from schemas.reasons import BRIDGE_REASON_TEXTS, LEFT_OUT_TEXTS, LeftOutReason
 from schemas.topics import TOPICS, Topic
 from services.cli import main as cli
 from services.cli.table import COMMANDS, ListedCommand
@@ -318,9 +318,9 @@ def _which(row: ParameterSpec) -> str:
 def bridge_reasons() -> str:
     """Return the reasons of fused states, and of excluded crossings."""
     rows = [(f"`{code}`", text) for code, text in BRIDGE_REASON_TEXTS.items()]
+    excluded = LEFT_OUT_TEXTS | {LeftOutReason.SUSPECT: "its verdict is suspect"}
     rows += [
-        (f"`{code}` (excluded)", f"{text[0].upper()}{text[1:]}.")
-        for code, text in LEFT_OUT_TEXTS.items()
+        (f"`{code}` (excluded)", f"{text[0].upper()}{text[1:]}.") for code, text in excluded.items()
     ]
     return _table(("reason", "meaning"), rows)
 

@@ -134,9 +134,12 @@ def from_normal(
     centre: FloatArray,
     bias_direction: FloatArray,
 ) -> CompliancePosterior:
-    """Return the density of a normal (f, f), (f,), c at `elements`, times priors, truncated.
+    """Return the posterior of a normal likelihood `precision` (f, f), `linear` (f,) and the priors.
 
-    `log_odds` (f,) as in `posterior.log_odds_of_absence`.
+    Coordinates `elements` (e,) are compliances c; `sigma` (e,) are the spreads of ln EI, `centre`
+    (e,) the compliances at the optimum. Coordinates `cut_off` (k,) are truncated at zero.
+    `log_odds` (f,) are those of `posterior.log_odds_of_absence`, `bias_direction` (f,) is that of
+    `mismatch_bias`, and `inflation` the noise relative to the declared one.
     """
     sampled = np.concatenate([elements, cut_off])
     others = np.setdiff1d(np.arange(linear.size), sampled)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.crossing.noise import FRICTION_GAIN_OF_MISFIT, no_force_noise
+from pre_core.crossing.noise import FRICTION_STATISTIC_OF_MISFIT, no_suspension_noise
 from pre_core.crossing.posterior import (
     PosteriorProblem,
     all_rows,
@@ -34,8 +34,8 @@ from pre_core.search.levenberg_marquardt import Rows, minimise
 from pre_core.search.loop import SearchResult, Termination
 
 _FREE_STAGES = ((5.0, 8, 0.2), (1.0, 25, 0.1))
-"""Temperatures (factors of the noise), steps at each, and the gain in the sum of squares that ends
-it."""
+"""Temperatures (factors of the noise), steps at each, and the improvement of the sum of squares
+that ends it."""
 _CLEAR_FRICTION_WEIGHT = 0.05
 """Weight of the suspension equations below which full weight is not tried: friction is clear."""
 NO_FIT_CHI2 = 10.0
@@ -57,15 +57,15 @@ _MAX_ROUNDS, _EARLY_ROUNDS = 6, 2
 """Limit of alternating fits and noise estimates, finally and in earlier stages."""
 _MAX_STEPS, _EARLY_STEPS = 25, 8
 """Limit of steps with mismatch, whose noise is estimated before every step; finally and earlier."""
-_MIN_GAIN_WITH_MISMATCH = 0.5
-"""Gain in the sum of squares that ends a search with mismatch, far within the uncertainty of poorly
-determined parameters."""
+_MIN_IMPROVEMENT_WITH_MISMATCH = 0.5
+"""Improvement of the sum of squares that ends a search with mismatch, far within the uncertainty of
+poorly determined parameters."""
 _SAME_LEVEL = 0.1
 """Relative change of a noise level that counts as converged."""
 _CLEAR_MISFIT = 5.0
 """Mean square of residuals and priors, with reduced weight of the suspension equations, above which
 a minimum need not be exact."""
-SMALL_GAIN, _CLEAR_MISFIT_CHI2 = 0.05, 2.0
+SMALL_IMPROVEMENT, _CLEAR_MISFIT_CHI2 = 0.05, 2.0
 """Relative reduction of chi2 below which no other noise or offset is tried at a clear misfit, and
 the chi2 of such a misfit. Of 16 fault-free crossings with mismatch, fits without it from four
 offsets had 1.9 to 12, within 12 % of each other."""
@@ -85,12 +85,12 @@ class SearchStrategy(NamedTuple):
     """Whether the suspension equations have full weight; such a search stops at clear friction."""
     max_candidates: int
     """Maximum number of candidate offsets from which all parameters are fitted."""
-    differs: bool
+    models_mismatch: bool
     """Whether profile mismatch is modelled from the first step; its level may become zero."""
 
 
 RefreshNoise = Callable[[PosteriorProblem, FloatArray], PosteriorProblem]
-"""Return the problem with its noise for another point."""
+"""Function that returns the problem with its noise for another point."""
 
 
 class Optimum(NamedTuple):
@@ -105,8 +105,8 @@ class Optimum(NamedTuple):
     """Number of offsets from which all parameters were freed."""
     stopped_by_friction: bool = False
     """Whether a search with full weight of the suspension equations was abandoned for friction."""
-    differs: bool = False
-    """Whether a search without mismatch was abandoned for a clear one."""
+    stopped_by_mismatch: bool = False
+    """Whether a search without mismatch was abandoned because of a clear mismatch."""
     unfinished: SearchStrategy | None = None
     """Strategy of a fit whose first stage ended at a poor start: `complete_fit` continues it."""
     noise_power: float = 1.0
@@ -146,7 +146,7 @@ def _descend(
     enough: float,
     is_free: bool = False,
 ) -> tuple[FloatArray, levenberg_marquardt.LMState, Termination, int]:
-    """Minimise along `directions` (f, d) from y until a step gains less than `enough`."""
+    """Minimise along `directions` (f, d) from y until a step improves by less than `enough`."""
     rows = tempered_residuals(problem, y, directions, temperature)
     start = np.zeros(directions.shape[1])
     lower = lower_bounds(problem, y, directions, is_free=is_free)
@@ -205,7 +205,7 @@ def is_accepted(problem: PosteriorProblem, chi2: float) -> bool:
 
 def is_better_misfit(chi2: float, last: float) -> bool:
     """Return whether a fit of this chi2 is worth another one after a fit of chi2 `last`."""
-    return chi2 <= max(_CLEAR_MISFIT_CHI2, (1.0 - SMALL_GAIN) * last)
+    return chi2 <= max(_CLEAR_MISFIT_CHI2, (1.0 - SMALL_IMPROVEMENT) * last)
 
 
 def fit_all(
@@ -308,7 +308,7 @@ def _optimum_at(problem: PosteriorProblem, y: FloatArray, ending: Termination) -
 
 
 def _at_full_weight(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
-    return update_noise(problem, y, no_force_noise())
+    return update_noise(problem, y, no_suspension_noise())
 
 
 def _fit_at_misfit(
@@ -321,7 +321,7 @@ def _fit_at_misfit(
 
 
 def _at_misfit(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
-    return update_noise(problem, y, friction_gain=FRICTION_GAIN_OF_MISFIT)
+    return update_noise(problem, y, friction_statistic=FRICTION_STATISTIC_OF_MISFIT)
 
 
 def _fit_in_noise_rounds(
@@ -371,7 +371,7 @@ def fit_stage(
     stage: tuple[float, int, float],
     refresh_noise: RefreshNoise,
 ) -> tuple[PosteriorProblem, FloatArray, Termination, int]:
-    """Fit along directions (f, d) before the last stage; `stage` is temperature, steps, least gain.
+    """Fit along directions (f, d) before the last stage; `stage`: temperature, steps, `enough`.
 
     Return problem, y, termination and number of evaluations. With mismatch the noise is estimated
     by `refresh_noise` before every step.
@@ -429,7 +429,7 @@ def _fit_in_noise_steps(
         share = 0.5 * share if float(np.sum(step * last)) < 0.0 else min(1.0, 2.0 * share)
         y = y + share * (directions @ there.y)
         last, damping = step, there.damping
-        if here.objective - there.objective < _MIN_GAIN_WITH_MISMATCH:
+        if here.objective - there.objective < _MIN_IMPROVEMENT_WITH_MISMATCH:
             ending = Termination.CONVERGED
             break
     return problem, y, ending, evaluations

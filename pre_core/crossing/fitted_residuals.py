@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.crossing.fit import chi2_per_dof
-from pre_core.crossing.noise import FRICTION_GAIN_OF_MISFIT, no_force_noise
+from pre_core.crossing.noise import FRICTION_STATISTIC_OF_MISFIT, no_suspension_noise
 from pre_core.crossing.off_bridge import levels_at, rear_axle_chainage_m
 from pre_core.crossing.posterior import PosteriorProblem, all_rows, data_rows, layout
 from pre_core.crossing.preparation import (
@@ -38,7 +38,7 @@ class FittedValues(NamedTuple):
     """Parameters (p,) in the order of `pre_core.parameters`; nominal where a value is unknown."""
     shift_m: float
     """Slow error of the receiver."""
-    differs: bool
+    has_mismatch: bool
     """Whether the fit modelled profile mismatch."""
     uses_suspension: bool
     """Whether the suspension equations had their full weight."""
@@ -68,9 +68,9 @@ def fitted_residuals(inputs: CrossingInputs, found: FittedValues) -> FittedResid
         problem = update_noise(
             problem,
             y,
-            no_force_noise() if found.uses_suspension else None,
-            FRICTION_GAIN_OF_MISFIT,
-            levels_at(problem, y) if found.differs else None,
+            no_suspension_noise() if found.uses_suspension else None,
+            FRICTION_STATISTIC_OF_MISFIT,
+            levels_at(problem, y) if found.has_mismatch else None,
         )
         y = _minimum(problem, y)
     white = data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)

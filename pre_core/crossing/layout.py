@@ -20,15 +20,15 @@ class ParameterLayout(NamedTuple):
     """Indices of the bridge's parameters in theta; `elements` are the last ones."""
     elements: NDArray[np.int64]
     half_normal: NDArray[np.int64]
-    """Coordinates that must not be negative."""
+    """Indices of coordinates that must not be negative."""
     wheelbase: int
     gains: slice
-    """Contrasts between the channels."""
+    """Indices of the contrasts between the channels' gains."""
     common_gain: int
     delays: slice
     initial: slice
     swing: slice
-    """Initial vibration of the bridge."""
+    """Indices of the initial vibration of the bridge."""
     trajectory: slice
     offset: int
     size: int

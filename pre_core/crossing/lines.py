@@ -9,7 +9,7 @@ squares with uninformative amplitudes (Golub & Pereyra 1973). This loses the inf
 a hertz of the line.
 
 A line is above 10 Hz, where neither body nor bridge of a short span vibrates, narrow, and as strong
-before the bridge as on and behind it, unlike any response of truck or bridge to a road.
+before the bridge as on and after it, unlike any response of truck or bridge to a road.
 """
 
 from collections.abc import Sequence

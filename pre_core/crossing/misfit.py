@@ -16,8 +16,8 @@ EXPLAINED_CHI2 = 1.5
 wrong span or an undeclared support acted on the bridge it was 1.0. With full weight of the
 suspension equations and one profile it was 25 or more where springs or profiles of fault-free
 crossings needed another model."""
-_STEPS, _GAIN = 12, 10.0
-"""Limit of steps, and the gain in the sum of squares that ends the fit, whose chi2 is judged
+_STEPS, _IMPROVEMENT = 12, 10.0
+"""Limit of steps, and the improvement of the sum of squares that ends the fit, whose chi2 is judged
 coarsely."""
 
 
@@ -46,7 +46,7 @@ def fit_off_bridge(found: Optimum) -> OffBridgeFit:
         values = all_rows(problem, y + v @ free.T)
         return np.concatenate([values[:, data], values[:, count:]], axis=1)
 
-    there = minimise(rows, np.zeros(free.shape[1]), _STEPS, _GAIN, is_followed=True)
+    there = minimise(rows, np.zeros(free.shape[1]), _STEPS, _IMPROVEMENT, is_followed=True)
     stride = chi2_stride(problem)
     white = there.state.residual[: data.size : stride]
     chi2 = float(white @ white) / max(1.0, white.size - free.shape[1] / stride)

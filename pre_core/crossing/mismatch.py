@@ -8,7 +8,7 @@ random process along the road with the one-sided spectrum
 The shapes T_j are those of axles on an isotropic surface (`physics.surface`): tyres that average
 over different strips, and an axle with a lateral offset. Both have a known limit at long waves,
 which affect the bridge but cannot be measured in one run. The levels A_j follow from the residuals
-before and behind the bridge. At the speed v, d is noise in time with the spectrum S_d(f/v)/v.
+before and after the bridge. At the speed v, d is noise in time with the spectrum S_d(f/v)/v.
 
 The Bohman window truncates the covariance of d and keeps it positive, so that the residuals'
 covariance is banded. Its half length of 5 m changes the spectrum of unequal tyres by at most 2 %,
@@ -38,7 +38,7 @@ _WORN = 0.9
 _GRID_CYCLES_PER_M = 0.02
 _MAX_CYCLES_PER_M = 24.0
 LONG_CYCLES_PER_M = 0.05
-"""Wave number relevant for bridges, at which a mismatch is reported."""
+"""Spatial frequency relevant for bridges, at which a mismatch is reported."""
 _EVERY_LONG, _OTHERS = 30, 50
 """Number of longest grid waves, and of others, for which the shared part is computed; it is smooth.
 """
@@ -65,8 +65,8 @@ class MismatchSpectra(NamedTuple):
     road: FloatArray
     """Windowed profile spectrum (g,) of the front axle on a surface of Phi k^3 = 1 m²."""
     road_spread: FloatArray
-    """Its ratio (g,) to the unwindowed one: the window spreads the longest waves, by far the
-    highest."""
+    """Ratio (g,) of `road` to the unwindowed spectrum: the window spreads the longest waves, by far
+    the highest."""
     expected_m: FloatArray
     """Expected levels (s,) in m³, divided by Phi k^3: of the given tyres, and of an offset of
     `_LARGE_OFFSET_M`."""
@@ -213,7 +213,7 @@ def front_cross_spectrum(mismatch: Mismatch, omega: FloatArray) -> FloatArray:
 
 
 def tilt_of(cycles_per_m: FloatArray) -> FloatArray:
-    """Return L (…) of `crossing.pavement` at wave numbers (…)."""
+    """Return ln(n/n_p), n limited to the tilted band, at spatial frequencies n (…)."""
     low, high = _TILTED_CYCLES_PER_M
     return np.asarray(np.log(np.clip(cycles_per_m, low, high) / _PIVOT_CYCLES_PER_M))
 
@@ -226,7 +226,7 @@ def long_wave_power(mismatch: Mismatch) -> float:
 
 
 def _power_ratio(pavement: BridgePavement, cycles_per_m: FloatArray) -> FloatArray:
-    """Return the expected power (g,) on the bridge over that off it at wave numbers (g,)."""
+    """Return the expected power (g,) on the bridge over that off it, at frequencies (g,)."""
     tilt = tilt_of(cycles_per_m)
     columns = np.stack([np.ones_like(tilt), tilt], axis=1)
     variance = np.einsum("gi,ij,gj->g", columns, pavement.covariance, columns)
@@ -327,10 +327,10 @@ def surface_level(
 def estimate_levels(
     segments: list[PeriodogramSegment], typical: FloatArray | None = None
 ) -> tuple[FloatArray, float]:
-    """Return the most likely levels (s,) in m³ (Whittle's likelihood), and the gain over none.
+    """Return the most likely levels (s,) in m³ (Whittle's likelihood), and a statistic.
 
-    `typical` (s,) are the means of their exponential priors, infinite without one; the gain is that
-    of `maximum_likelihood_levels`.
+    `typical` (s,) are the means of their exponential priors, infinite without one; the statistic is
+    that of `maximum_likelihood_levels`.
     """
     seen = np.concatenate([one.seen for one in segments])
     known = np.concatenate([one.sensors for one in segments])

@@ -11,13 +11,13 @@ acceleration noise of densities n_s, n_u enters them as
 are taken when the front wheel was at the rear wheel's present place, so that a sensor in both
 counts as two.
 
-Friction and nonlinear dampers put a force into the body equations that is noise of its own, of a
-level that the residuals determine (`force_noise`). The mismatch is then computed from inertia
-alone, s^2 R_i: [1 + m_u s^2/K] n_u + [m_ii s^2/K] n_s + [m_12 s^2/K] n_s'. Both forms differ by
-(k_s/K) b_i and contain the same information; but the quiet combination of residuals depends on the
-truck, and each form has it in a residual of its own where it is needed. Friction is correlated over
-a tenth of a second; the Bohman window, which keeps its covariance positive, truncates this, so that
-the residuals' covariance vanishes beyond it and the filter's length.
+Friction and nonlinear dampers put a random force, the suspension noise, into the body equations, of
+a level that the residuals determine (`suspension_noise_levels`). The mismatch is then computed from
+inertia alone, s^2 R_i: [1 + m_u s^2/K] n_u + [m_ii s^2/K] n_s + [m_12 s^2/K] n_s'. Both forms
+differ by (k_s/K) b_i and contain the same information; but the quiet combination of residuals
+depends on the truck, and each form has it in a residual of its own where it is needed. Friction is
+correlated over a tenth of a second; the Bohman window, which keeps its covariance positive,
+truncates this, so that the residuals' covariance vanishes beyond it and the filter's length.
 
 Where the two axles follow different profiles, their difference is noise of the mismatch alone
 (`crossing.mismatch`).
@@ -61,10 +61,10 @@ declared density has up to 1.6 before the truck is found; friction, bilinear dam
 to 100."""
 _SUSPENSION_BAND_HZ = 30.0
 """Highest frequency in the weight of the suspension equations."""
-FRICTION_GAIN, FRICTION_GAIN_OF_MISFIT = 60.0, 15.0
-"""Gain in twice the log-likelihood of an axle's residuals that reduces the weight of its suspension
-equations: the second where nothing else explains a misfit. Of 400 axles with sensor noise alone
-twelve gained more than 15, none more than 60."""
+FRICTION_STATISTIC, FRICTION_STATISTIC_OF_MISFIT = 60.0, 15.0
+"""Likelihood-ratio statistic (`whittle`) of an axle's residuals that reduces the weight of its
+suspension equations: the second where nothing else explains a misfit. Of 400 axles with sensor
+noise alone twelve had more than 15, none more than 60."""
 _EQUAL_TYRES = 0.05
 """Sensitivity to the mismatch of unequal tyres below which tyres count as equal; the visible part
 is then an axle's offset, whose long waves are twice as large, and short ones hardly distinguish
@@ -119,7 +119,7 @@ def force_masses(truck: NoisePath) -> FloatArray:
     return np.outer([share, 1.0 - share], [load.bogie_1, load.bogie_2])
 
 
-def no_force_noise() -> FloatArray:
+def no_suspension_noise() -> FloatArray:
     """Return zero levels (2, shapes) of suspension noise, in N²/Hz."""
     return np.zeros((2, FORCE_SHAPES))
 
@@ -206,7 +206,7 @@ def noise_spectrum(
             * tandem.friction_passage(truck.lead, truck.theta, truck.gap_m, truck.lag_s, omega)
         )
     elif force.any():
-        spectrum[[1, 2], [1, 2]] += _force_noise_spectra(truck, force, omega)
+        spectrum[[1, 2], [1, 2]] += _suspension_noise_spectra(truck, force, omega)
     if road is not None:
         spectrum[0, 0] += omega**4 * _mismatch.spectrum(road, omega)
     return spectrum
@@ -219,7 +219,7 @@ def _body_spectra(
     return np.asarray(noise_spectrum(truck, density, force, None, omega)[[1, 2], [1, 2]].real)
 
 
-def _force_noise_spectra(truck: NoisePath, force: FloatArray, omega: FloatArray) -> FloatArray:
+def _suspension_noise_spectra(truck: NoisePath, force: FloatArray, omega: FloatArray) -> FloatArray:
     """Return the contribution of suspension noise to the spectra of the body equations: (2, f)."""
     over = body_divisors(truck)[:, None]
     return np.asarray((force @ force_shapes(omega)) * omega**4 / over**2)
@@ -338,10 +338,10 @@ def mismatch_levels(
     stretches: list[FloatArray],
     roads: list[FloatArray],
 ) -> tuple[FloatArray, float, FloatArray]:
-    """Return levels (s,) in m³ of segments of mismatch residuals, and their gain.
+    """Return levels (s,) in m³ of segments of mismatch residuals, and a statistic.
 
-    The gain is that of their likelihood over zero; the third value holds the levels (s,) of the
-    declared axles on a surface as rough as the road.
+    The statistic is that of their likelihood over zero (`whittle`); the third value holds the
+    levels (s,) of the declared axles on a surface as rough as the road.
 
     Each segment (m,) is of consecutive filtered residuals without effect of a bridge; `roads` are
     residuals of one axle's profile there, treated as the front one, which bound an axle's offset.
@@ -352,43 +352,43 @@ def mismatch_levels(
     longest = max(stretch.size for stretch in stretches)
     memory = min(_mismatch.correlation_time_s(road), longest * rows.every * rows.step_s)
     turn = phases(rows, memory)
-    sensors = noise_spectrum(truck, density, no_force_noise(), None, omega)[0, 0].real * rows.power
-    of_sensors, of_shapes = (sensors @ turn).real, (shape @ turn).real
+    sensors = noise_spectrum(truck, density, no_suspension_noise(), None, omega)[0, 0].real
+    of_sensors, of_shapes = ((sensors * rows.power) @ turn).real, (shape @ turn).real
     whole = [_mismatch.tapered_periodogram(one, of_sensors, of_shapes[-1:]) for one in roads]
     metres = rows.every * rows.step_s * road.speed_m_per_s
     surface = _mismatch.surface_level(shapes, whole, [metres * one.size for one in roads])
     expected = surface * shapes.expected_m
     usual = np.array([np.inf, expected[1]])
     parts = [_mismatch.tapered_periodogram(one, of_sensors, of_shapes[:-1]) for one in stretches]
-    level, gain = _mismatch.estimate_levels(parts, usual)
+    level, statistic = _mismatch.estimate_levels(parts, usual)
     if level[0] >= _EQUAL_TYRES * expected[0]:
-        return level, gain, expected
+        return level, statistic, expected
     alike = [part._replace(shapes=part.shapes[1:]) for part in parts]
-    level, gain = _mismatch.estimate_levels(alike, usual[1:])
-    return np.concatenate([[0.0], level]), gain, expected
+    level, statistic = _mismatch.estimate_levels(alike, usual[1:])
+    return np.concatenate([[0.0], level]), statistic, expected
 
 
-def force_noise(
+def suspension_noise_levels(
     rows: RowFilter,
     truck: NoisePath,
     density: FloatArray,
     body: FloatArray,
-    friction_gain: float = FRICTION_GAIN,
+    friction_statistic: float = FRICTION_STATISTIC,
 ) -> FloatArray:
     """Return levels (2, shapes) of suspension noise in N²/Hz from body equations (2, m).
 
-    They are the most likely levels in addition to sensor noise (`whittle`). An axle that gains at
-    most `friction_gain` in likelihood has linear suspension within sensor noise, and level zero.
+    They are the most likely levels in addition to sensor noise (`whittle`). An axle with
+    at most `friction_statistic` has linear suspension within sensor noise, and level zero.
     """
     _, shown, sensors, shapes = _body_periodogram(rows, truck, density, body)
     over = body_divisors(truck)
-    levels = no_force_noise()
+    levels = no_suspension_noise()
     for axle in range(2):
         shape = shapes / over[axle] ** 2
         seen, known = shown[axle], sensors[axle]
         level = np.full(FORCE_SHAPES, seen.mean()) / shape.mean(axis=1)
-        level, gain = maximum_likelihood_levels(seen, known, shape, level)
-        if gain > friction_gain:
+        level, statistic = maximum_likelihood_levels(seen, known, shape, level)
+        if statistic > friction_statistic:
             levels[axle] = level
     return levels
 
@@ -412,7 +412,7 @@ def _body_periodogram(
     interval = (rows.omega[1] - rows.omega[0]) / (2.0 * np.pi)
     for at in (omega, 4.0 * np.pi * (0.5 / apart) - omega):  # frequencies above half the rate alias
         power = np.interp(at, rows.omega, rows.power) / interval
-        sensors += _body_spectra(truck, density, no_force_noise(), at) * power
+        sensors += _body_spectra(truck, density, no_suspension_noise(), at) * power
         shapes += force_shapes(at) * at**4 * power
     return omega, shown, sensors, shapes
 
@@ -444,6 +444,6 @@ def suspension_equation_weight(
     `density` (4,) is that of the sensors, `force` (2, shapes) the suspension noise in N²/Hz.
     """
     low = rows.omega[rows.omega < 2.0 * np.pi * _SUSPENSION_BAND_HZ]
-    sensors = _body_spectra(truck, density, no_force_noise(), low)
+    sensors = _body_spectra(truck, density, no_suspension_noise(), low)
     weight = sensors / _body_spectra(truck, density, force, low)
     return float(weight[1 if truck.lead.ahead_m > 0.0 else 0 :].mean())

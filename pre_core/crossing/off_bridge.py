@@ -17,18 +17,18 @@ from pre_core.physics.simulate import rear_position_m
 FEWEST_ROWS = 24
 """Fewest residuals in one segment that determine the mismatch."""
 _STEP_SAMPLES = 9
-MIN_MISMATCH_GAIN = 30.0
-"""Smallest gain in twice the log-likelihood of the residuals off the bridge."""
+MIN_MISMATCH_STATISTIC = 30.0
+"""Smallest likelihood-ratio statistic (`whittle`) of the residuals off the bridge."""
 
 
 def levels_at(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
     """Return the mismatch levels (s,) of the residuals off the bridge at y (size,).
 
     They are zero where too few residuals exist, or where a mismatch explains them no better
-    (`MIN_MISMATCH_GAIN`).
+    (`MIN_MISMATCH_STATISTIC`).
     """
-    level, gain, _ = _levels_off_bridge(problem, y)
-    return level if gain > MIN_MISMATCH_GAIN else np.zeros_like(level)
+    level, statistic, _ = _levels_off_bridge(problem, y)
+    return level if statistic > MIN_MISMATCH_STATISTIC else np.zeros_like(level)
 
 
 def mismatch_excess(problem: PosteriorProblem, y: FloatArray) -> float:
@@ -50,7 +50,7 @@ def surface_level_at(problem: PosteriorProblem, y: FloatArray) -> float:
 def _levels_off_bridge(
     problem: PosteriorProblem, y: FloatArray
 ) -> tuple[FloatArray, float, FloatArray]:
-    """Return the results of `mismatch_levels` for the segments before and behind the bridge."""
+    """Return the results of `mismatch_levels` for the segments before and after the bridge."""
     some = [one for one in off_bridge_residuals(problem, y) if one.stop - one.start >= FEWEST_ROWS]
     if not some:
         nothing = np.zeros_like(problem.mismatch.level_m3)
@@ -88,14 +88,14 @@ def compared_length_m(problem: PosteriorProblem, y: FloatArray) -> float:
 
 
 def off_bridge_residuals(problem: PosteriorProblem, y: FloatArray) -> tuple[slice, slice]:
-    """Return the slices of filtered residuals before and behind the bridge, at y (size,)."""
+    """Return the slices of filtered residuals before and after the bridge, at y (size,)."""
     at = points(problem, y[None, :])
     crossing, rows = problem.crossing, problem.rows
     rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), crossing.direction)
     travel = (rear if crossing.direction > 0 else crossing.span_m - rear)[crossing.first_row :]
     on, left = np.searchsorted(travel, [0.0, crossing.span_m])
     count = row_count(rows, crossing.rows)
-    # A compliant bearing affects some samples before and behind the end.
+    # A compliant bearing affects some samples before and after the end.
     last = (int(on) - _STEP_SAMPLES - rows.taps.size) // rows.every + 1
     first = -((-int(left) - _STEP_SAMPLES) // rows.every)
     return slice(0, min(max(0, last), count)), slice(min(max(0, first), count), count)

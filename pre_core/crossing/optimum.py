@@ -20,7 +20,7 @@ from pre_core.crossing.fit import (
     FAR_OFF_CHI2,
     HOPELESS_CHI2,
     NO_FIT_CHI2,
-    SMALL_GAIN,
+    SMALL_IMPROVEMENT,
     WORTH_COMPLETING_CHI2,
     Optimum,
     SearchStrategy,
@@ -33,7 +33,7 @@ from pre_core.crossing.fit import (
 )
 from pre_core.crossing.misfit import fit_off_bridge, is_explained_off_bridge
 from pre_core.crossing.mismatch import has_equal_tyres
-from pre_core.crossing.noise import no_force_noise
+from pre_core.crossing.noise import no_suspension_noise
 from pre_core.crossing.off_bridge import levels_at, off_bridge_residuals
 from pre_core.crossing.posterior import (
     PosteriorProblem,
@@ -170,7 +170,7 @@ def _has_ended(found: Optimum) -> bool:
     return strongest_line_at_hz(found.problem, found.state.y) > 0.0
 
 
-def _other_strategies(first: Optimum) -> tuple[tuple[SearchStrategy, ...], int]:
+def _other_strategies(fit: Optimum) -> tuple[tuple[SearchStrategy, ...], int]:
     """Return the strategies to try after the simplest has not ended at a fit, and evaluations.
 
     Where a linear truck on one profile explains the residuals off the bridge, no other truck is
@@ -178,10 +178,10 @@ def _other_strategies(first: Optimum) -> tuple[tuple[SearchStrategy, ...], int]:
     """
     full_weight, reduced_weight = _WITHOUT_MISMATCH
     strategies: tuple[SearchStrategy, ...] = (reduced_weight, *_WITH_MISMATCH, full_weight)
-    if first.differs or first.stopped_by_friction or first.problem.mismatch.level_m3.any():
+    if fit.stopped_by_mismatch or fit.stopped_by_friction or fit.problem.mismatch.level_m3.any():
         return strategies, 0
-    alone = fit_off_bridge(first)
-    if is_explained_off_bridge(first.problem, alone):
+    alone = fit_off_bridge(fit)
+    if is_explained_off_bridge(fit.problem, alone):
         strategies = (full_weight,)
     return strategies, alone.evaluations
 
@@ -215,7 +215,7 @@ def _budget_left(max_evaluations: int, found: list[Optimum]) -> _Budget:
     reached = min((one.chi2_per_dof for one in found if one.unfinished is None), default=np.inf)
     return _Budget(
         max_evaluations - _evaluations_of_all(found),
-        min(WORTH_COMPLETING_CHI2, (1.0 - SMALL_GAIN) * reached),
+        min(WORTH_COMPLETING_CHI2, (1.0 - SMALL_IMPROVEMENT) * reached),
     )
 
 
@@ -251,7 +251,7 @@ def _refine_likeliest(
     There is none, as without finite residuals, as soon as a candidate shows that the strategy is
     wrong.
     """
-    force = no_force_noise() if strategy.uses_suspension else None
+    force = no_suspension_noise() if strategy.uses_suspension else None
     # With the noise of a front axle ahead of a tandem, offsets metres apart would fit alike.
     front_axle, problem = problem.front_axle, problem._replace(front_axle=None)
     problem, y, evaluations = _find_truck(problem, y, strategy, report, force)
@@ -263,8 +263,8 @@ def _refine_likeliest(
         problem = update_noise(problem, y, force)
     else:
         power = 1.0
-    if not strategy.differs and _has_clear_mismatch(problem, y):
-        return _no_optimum(problem, y, evaluations, 0, differs=True)
+    if not strategy.models_mismatch and _has_clear_mismatch(problem, y):
+        return _no_optimum(problem, y, evaluations, 0, has_mismatch=True)
     report("finding the bridge", 0.2)
     places, used = scan_offsets(problem, y, strategy)
     problem, evaluations = problem._replace(front_axle=front_axle), evaluations + used
@@ -366,14 +366,14 @@ def _find_truck(
         return update_noise(problem, y, force)
 
     evaluations = 0
-    if strategy.differs and not is_alike:
+    if strategy.models_mismatch and not is_alike:
         problem = update_noise(problem, y, force, mismatch=levels_at(problem, y))
-    for temperature, steps in _COARSE_WITH_MISMATCH if strategy.differs else _COARSE:
+    for temperature, steps in _COARSE_WITH_MISMATCH if strategy.models_mismatch else _COARSE:
         report("finding the truck", 0.05)
         problem, y, _, used = fit_stage(problem, y, whole, (temperature, steps, 0.5), with_force)
         evaluations += used
         problem = update_noise(problem, y, force)
-    if strategy.differs and is_alike:
+    if strategy.models_mismatch and is_alike:
         problem = update_noise(problem, y, force, mismatch=levels_at(problem, y))
     return problem, y, evaluations
 
@@ -435,12 +435,12 @@ def _no_optimum(
     starts: int,
     *,
     has_friction: bool = False,
-    differs: bool = False,
+    has_mismatch: bool = False,
 ) -> Optimum:
     """Return the result of a search that ended without an optimum."""
     state = levenberg_marquardt.initial_state(lambda at: all_rows(problem, at), y)
     ending = Termination.NOT_FINITE
-    return Optimum(problem, state, ending, np.inf, evaluations, starts, has_friction, differs)
+    return Optimum(problem, state, ending, np.inf, evaluations, starts, has_friction, has_mismatch)
 
 
 def _has_clear_mismatch(problem: PosteriorProblem, y: FloatArray) -> bool:

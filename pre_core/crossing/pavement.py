@@ -17,7 +17,7 @@ import numpy as np
 
 from pre_core.crossing import mismatch as _mismatch
 from pre_core.crossing.mismatch import BridgePavement, Mismatch
-from pre_core.crossing.noise import no_force_noise, noise_spectrum
+from pre_core.crossing.noise import no_suspension_noise, noise_spectrum
 from pre_core.crossing.off_bridge import FEWEST_ROWS, rear_axle_chainage_m, rear_axle_samples_m
 from pre_core.crossing.posterior import PosteriorProblem, filtered_rows, noise_path_at
 from pre_core.crossing.rows import RESIDUALS, filter_rows, phases
@@ -28,7 +28,7 @@ RATIO_SPREAD, TILT_SPREAD = 0.7, 0.12
 """Standard deviations of r and t. A measured deck was 2.5 to 3.8 times as
 rough as the road before it (studies/pavement.md)."""
 _SHORT_CYCLES_PER_M = (0.3, 4.0)
-"""Wave numbers that no deflection of the bridge has, and that tyres do not average out."""
+"""Spatial frequencies that no deflection of the bridge has, and that tyres do not average out."""
 _JOINT_M = 0.5
 """Distance from an end of the deck within which a joint acts."""
 _BLEND_M = 0.5
@@ -60,7 +60,7 @@ def estimate_pavement(
     omega = rows.omega
     density = level_m3 @ _mismatch.density_at(road, omega, road.shapes.density)
     truck, sensor = noise_path_at(problem, y)
-    of_sensors = noise_spectrum(truck, sensor, no_force_noise(), None, omega)[0, 0].real
+    of_sensors = noise_spectrum(truck, sensor, no_suspension_noise(), None, omega)[0, 0].real
     apart_s = rows.every * rows.step_s
     memory = min(_mismatch.correlation_time_s(road), stretch.size * apart_s)
     turn = phases(rows, memory)

@@ -92,7 +92,7 @@ class PosteriorProblem(NamedTuple):
     noise: Whitener
     density: FloatArray  # (4,) one-sided, m/s²/√Hz
     force: FloatArray
-    """Noise (2, shapes) of springs and dampers, N²/Hz; see whitening.py."""
+    """Suspension noise (2, shapes) of springs and dampers, N²/Hz; see suspension_noise.py."""
     mismatch: Mismatch
     """Profile mismatch; without level where both axles follow one profile."""
     basis_position: FloatArray  # (n, b): trajectory = basis @ coefficients

@@ -11,13 +11,13 @@ from pre_core.crossing.channels import A, channel_signals
 from pre_core.crossing.front_axle import without_front_axle
 from pre_core.crossing.mismatch import BridgePavement, Mismatch, mismatch_spectra
 from pre_core.crossing.noise import (
-    FRICTION_GAIN,
+    FRICTION_STATISTIC,
     NoisePath,
-    force_noise,
     mismatch_power,
-    no_force_noise,
+    no_suspension_noise,
     noise_path,
     noise_power,
+    suspension_noise_levels,
 )
 from pre_core.crossing.off_bridge import levels_at
 from pre_core.crossing.pavement import estimate_pavement, parts_of, without_joints
@@ -142,7 +142,7 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
         row_count(row, crossing.rows),
         noise_path(theta, crossing.total_mass_kg, wheelbase, False, crossing.lead, speed),
         inputs.density_m_per_s2_per_rthz,
-        no_force_noise(),
+        no_suspension_noise(),
     )
     shapes = mismatch_spectra(*inputs.footprints)
     problem = PosteriorProblem(
@@ -151,7 +151,7 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
         row,
         noise,
         inputs.density_m_per_s2_per_rthz,
-        no_force_noise(),
+        no_suspension_noise(),
         Mismatch(shapes, np.zeros(shapes.density.shape[0]), speed),
         position,
         speeding,
@@ -196,25 +196,27 @@ def update_noise(
     problem: PosteriorProblem,
     y: FloatArray,
     force: FloatArray | None = None,
-    friction_gain: float = FRICTION_GAIN,
+    friction_statistic: float = FRICTION_STATISTIC,
     mismatch: FloatArray | None = None,
     pavement: BridgePavement | None = None,
 ) -> PosteriorProblem:
     """Return the problem with the noise for the truck at y (size,), and bridge coordinates for it.
 
     The suspension noise is `force` (2, shapes), by default that of the body equations at y if it is
-    at least `friction_gain` (`force_noise`). Mismatch levels are `mismatch` (s,), by default those
-    of the residuals off the bridge at y if the problem has levels already. With mismatch, that on
-    the bridge is `pavement`, by default estimated at y.
+    at least `friction_statistic` (`suspension_noise_levels`). Mismatch levels are `mismatch` (s,),
+    by default those of the residuals off the bridge at y if the problem has levels already. With
+    mismatch, that on the bridge is `pavement`, by default estimated at y.
     """
     where = layout(problem)
     unknowns = where.gains.stop
     if has_tandem(problem):
-        force = no_force_noise() if problem.crossing.lead.is_equalised else force
+        force = no_suspension_noise() if problem.crossing.lead.is_equalised else force
         problem = _with_lead_motion(problem, y)
     if force is None:
         body = filtered_rows(problem, y)[1:]
-        force = force_noise(problem.rows, *noise_path_at(problem, y), body, friction_gain)
+        force = suspension_noise_levels(
+            problem.rows, *noise_path_at(problem, y), body, friction_statistic
+        )
     if mismatch is None:
         mismatch = problem.mismatch.level_m3
         if mismatch.any():
@@ -319,7 +321,7 @@ def with_line(problem: PosteriorProblem, y: FloatArray, line_hz: float) -> Poste
     line_waves = lines.line_waves(all_hz, count, problem.rows.every * problem.rows.step_s)
     one_road = np.zeros_like(problem.mismatch.level_m3)
     problem = problem._replace(lines_hz=all_hz, line_waves=line_waves)
-    return update_noise(problem, y, no_force_noise(), mismatch=one_road)
+    return update_noise(problem, y, no_suspension_noise(), mismatch=one_road)
 
 
 def lines_hz(problem: PosteriorProblem) -> list[float]:

@@ -29,8 +29,8 @@ _MIN_EFFECTIVE_SHARE = 1.0 / 3.0
 _BATCH_SHARE = 1.0 / 3.0
 """Size of a batch of weighted draws, relative to the requested ones."""
 _UNWEIGHTED_BATCHES = 2
-"""Number of batches after which the surrogate is refined without weights: the first one's draws lie
-too far apart from the posterior for weights that mean anything."""
+"""Number of first batches whose refinement ignores the weights: their draws lie too far from the
+posterior for weights that mean anything."""
 _MAX_BATCHES = 25
 _MAX_RUNS = 14
 """Limit of draws with mismatch, relative to the requested ones."""

@@ -1,4 +1,4 @@
-"""Spectra of suspension noise, due to friction and nonlinear dampers, as bumps of known shape."""
+"""Spectra of suspension noise, by friction and nonlinear dampers, from basis functions."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,8 @@ was 0.34 standard deviations too low (the median of 36 crossings with friction) 
 %; with it 0.09 and 97 %, with intervals of the same width."""
 _FORCE_CENTRES_HZ = np.arange(0.0, 60.0, 4.0)
 FORCE_SHAPES = _FORCE_CENTRES_HZ.size
-"""Number of bumps, a few hertz wide, in the spectrum of the suspension noise: that of dry friction
-falls by six decades from the body's bounce to the residuals' highest frequency."""
+"""Number of basis functions, a few hertz wide, in the spectrum of the suspension noise: that of dry
+friction falls by six decades from the body's bounce to the residuals' highest frequency."""
 FORCE_MEMORY_S = 0.3
 """Lag in s beyond which the suspension noise has no covariance; it sets the bumps' width."""
 

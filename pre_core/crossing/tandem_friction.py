@@ -1,4 +1,4 @@
-"""Friction of a tandem whose axles do not share their load, relative to that load."""
+"""Friction of a tandem without load equalisation, relative to its load."""
 
 from pre_core.crossing.posterior import PosteriorProblem, has_tandem, points
 from pre_core.crossing.suspension_noise import force_rms_n
@@ -7,7 +7,7 @@ from pre_core.physics.tandem import shared_load
 
 
 def tandem_friction(problem: PosteriorProblem, y: FloatArray) -> float:
-    """Return the friction of a tandem's springs over their static load, of the truck at y (size,).
+    """Return the rms friction of a tandem's springs over their static load, at y (size,).
 
     Zero for a truck without a tandem, and for an equalised one, whose friction does not matter.
     """

@@ -24,10 +24,10 @@ _JERK_M_PER_S3 = 0.3
 
 
 class Trajectory(NamedTuple):
-    """A fitted curve; `misfit` is the root mean square of the fixes' standardised residuals."""
+    """A fitted curve; `standardised_rms` is that of the fixes' residuals over their noise."""
 
     spline: Spline
-    misfit: float
+    standardised_rms: float
 
 
 def fit_trajectory(

@@ -31,8 +31,8 @@ _WALK_TEMPERATURE = 3.0
 """Temperature of the offset scan, at which minima are wide."""
 _WALK_STEPS = 6
 """Steps at each offset, enough to compare it with the others."""
-_WALK_MIN_GAIN = 0.5
-"""Gain in the sum of squares that ends the fit of an offset."""
+_WALK_MIN_IMPROVEMENT = 0.5
+"""Improvement of the sum of squares that ends the fit of an offset."""
 _STRIDE_M = 0.6
 """Distance of scanned offsets."""
 _REFINED_M = (0.3, 0.15)
@@ -57,7 +57,7 @@ class Placement(NamedTuple):
 
 
 LocalFit = Callable[[float, FloatArray], tuple[Placement, int]]
-"""Return the candidate at a shift in m from starting parameters, and the evaluations."""
+"""Function that returns the candidate at a shift in m from a start, and its evaluations."""
 
 
 def _local_fit(problem: PosteriorProblem, y: FloatArray, strategy: SearchStrategy) -> LocalFit:
@@ -81,7 +81,9 @@ def _local_fit(problem: PosteriorProblem, y: FloatArray, strategy: SearchStrateg
             return np.asarray(values - (values @ others) @ others.T)
 
         lower = lower_bounds(problem, moved, free[:, places], is_free=True)
-        found = minimise(projected, start, _WALK_STEPS, _WALK_MIN_GAIN, lower, is_followed=True)
+        found = minimise(
+            projected, start, _WALK_STEPS, _WALK_MIN_IMPROVEMENT, lower, is_followed=True
+        )
         place = Placement(found.state.objective, shift, found.state.y, places)
         return place, evaluations_of(found)
 
@@ -142,7 +144,7 @@ def better_neighbour(found: Optimum, strategy: SearchStrategy) -> tuple[Placemen
             place, used = local_fit(_NEIGHBOUR_M * number, nothing)
             evaluations += used
             best = min(best, place, key=lambda one: one.objective)
-    return (best if best.objective < here.objective - _WALK_MIN_GAIN else None), evaluations
+    return (best if best.objective < here.objective - _WALK_MIN_IMPROVEMENT else None), evaluations
 
 
 def shifted_to(problem: PosteriorProblem, y: FloatArray, place: Placement) -> FloatArray:

@@ -56,8 +56,8 @@ def whitener(
 ) -> Whitener:
     """Return the factor for `count` filtered residuals; `density` (4,) is one-sided, in m/s²/√Hz.
 
-    `force` (2, shapes) is the suspension noise in N²/Hz (`no_force_noise` without any), `road` the
-    mismatch. Raise ValueError where the densities leave some residual without noise, or if the
+    `force` (2, shapes) is the suspension noise in N²/Hz (`no_suspension_noise` without any), `road`
+    the mismatch. Raise ValueError where the densities leave some residual without noise, or if the
     mismatch on the bridge is that of another number of residuals.
     """
     has_pavement = road is not None and road.pavement is not None

@@ -16,12 +16,12 @@ def maximum_likelihood_levels(
     prior_power: FloatArray | float = 0.0,
     tolerance: float = 0.0,
 ) -> tuple[FloatArray, float]:
-    """Return the most likely levels (s,) of shapes (s, f) in a periodogram (f,), and their gain.
+    """Return the most likely levels (s,) of shapes (s, f) in a periodogram (f,), and a statistic.
 
-    `known` (f,) is the spectrum without them. The gain is half the likelihood-ratio statistic
-    2 ln(L/L_0), because a taper correlates neighbours: every other frequency is independent. Every
-    level is multiplied by the root of its explained over its claimed power (`prior_power` more, by
-    a prior) until none changes by more than `tolerance`.
+    `known` (f,) is the spectrum without them. The statistic is the likelihood ratio 2 ln(L/L_0) of
+    independent frequencies: the sum over all of them, halved because a taper correlates neighbours.
+    Every level is multiplied by the root of its explained over its claimed power (`prior_power`
+    more, by a prior) until none changes by more than `tolerance`.
     """
     level = start
     for _ in range(_PASSES):
@@ -33,5 +33,5 @@ def maximum_likelihood_levels(
         if np.abs(change[level > tolerance * level.max()] - 1.0).max(initial=0.0) < tolerance:
             break
     expected = known + level @ shape
-    gain = np.sum(np.log(known / expected) + periodogram / known - periodogram / expected)
-    return level, float(gain)
+    statistic = np.sum(np.log(known / expected) + periodogram / known - periodogram / expected)
+    return level, float(statistic)

@@ -1,9 +1,9 @@
 """Calibration of a method's intervals by many crossings of known truth.
 
 Each function takes errors or ranks and returns their deviation from calibrated ones. Ranks and
-normal scores of one crossing are dependent (its elements share a scale error, errors of neighbours
-are anticorrelated), so standard errors are taken between crossings, and a group of parameters is
-tested parameter by parameter.
+standardised errors of one crossing are dependent (its elements share the common scale uncertainty,
+errors of neighbours are anticorrelated), so standard errors are taken between crossings, and a
+group of parameters is tested parameter by parameter.
 """
 
 from typing import NamedTuple
@@ -23,14 +23,14 @@ class Scores(NamedTuple):
     seeds: NDArray[np.int64]  # (crossings,)
     is_good: NDArray[np.bool_]  # (crossings,)
     z: FloatArray
-    """Normal score (mean - truth)/std of EI."""
+    """Standardised error (mean - truth)/std of EI."""
     z_log: FloatArray
-    """Normal score of ln EI, whose mean and std come from the quantiles."""
+    """Standardised error of ln EI, whose mean and std come from the quantiles."""
     is_covered: NDArray[np.bool_]
     """Whether the truth lies between the 2.5 and 97.5 % quantiles."""
     std_log: FloatArray
     bound: FloatArray
-    """Cramér-Rao bound of ln EI with the scale error."""
+    """Cramér-Rao bound of ln EI with the common scale uncertainty."""
 
 
 class Share(NamedTuple):
@@ -53,7 +53,7 @@ def pooled_share(hits: FloatArray) -> Share:
 
 
 def root_mean_square(z: FloatArray) -> float:
-    """Return the root mean square of normal scores (…): 1 for true intervals."""
+    """Return the root mean square of standardised errors (…): 1 for true intervals."""
     return float(np.sqrt(np.mean(z * z)))
 
 
@@ -69,8 +69,8 @@ def rank(draws: FloatArray, truth: FloatArray) -> FloatArray:
 def rank_from_quantiles(truth: float, low: float, middle: float, high: float) -> float:
     """Return the rank of the truth from the 2.5, 50 and 97.5 % quantiles.
 
-    The normal score is interpolated between and beyond them, linearly in the logarithm if all are
-    positive, linearly otherwise: exact for a log-normal posterior, and for a normal one that
+    The standardised error is interpolated between and beyond them, linearly in the logarithm if all
+    are positive, linearly otherwise: exact for a log-normal posterior, and for a normal one that
     reaches below zero. Draws (`rank`) need no such shape.
     """
     values = np.array([low, middle, high, truth])

@@ -23,11 +23,11 @@ _TOP_OF_BAND: Final = 0.42
 _MEDIAN_OF_POWER: Final = 0.71
 """Ratio of the median over a dozen pieces to the mean; ln 2 for very many pieces."""
 _WHEELS_HZ: Final = 120.0
-"""Wheels hop at ten hertz, and what frames and brackets do has died away."""
+"""Frequency above which wheel hop and vibration of frames and brackets have died away."""
 
 
 class NoiseSegment(NamedTuple):
-    """A stretch of samples (n,) of one channel, gaps left out, and whether the truck stood."""
+    """A stretch of samples (n,) of one channel without gaps, and whether the truck stood still."""
 
     values: Floats
     rate_hz: float

@@ -71,7 +71,7 @@ def repeated_extremes(values: FloatArray, digits: float = 1e-5) -> int:
     )
 
 
-class Rail(NamedTuple):
+class SaturationEvidence(NamedTuple):
     """Accumulation of a signal's values at an end of its range; see `pile_up`."""
 
     ratio: float
@@ -81,8 +81,8 @@ class Rail(NamedTuple):
     level: float
 
 
-def pile_up(values: FloatArray, bins: int = 100) -> Rail:
-    """Detect a level that a signal (n,) should exceed and does not.
+def pile_up(values: FloatArray, bins: int = 100) -> SaturationEvidence:
+    """Return how strongly a signal (n,) piles up at an end of its range, as when saturated.
 
     The density of an unsaturated signal decreases towards its ends: a smooth peak spends most of
     its time at its top, yet in the uppermost hundredth only 2.4 times as long as in the next. A
@@ -92,7 +92,7 @@ def pile_up(values: FloatArray, bins: int = 100) -> Rail:
     """
     centred = values - np.median(values)
     step = converter_step(values)
-    worst = Rail(0.0, 0, 0.0)
+    worst = SaturationEvidence(0.0, 0, 0.0)
     for sign in (1.0, -1.0):
         side = sign * centred
         top = float(side.max())
@@ -115,7 +115,7 @@ def pile_up(values: FloatArray, bins: int = 100) -> Rail:
             if ratio > worst.ratio:
                 there = place >= k
                 visits = int(np.count_nonzero(there[1:] & ~there[:-1])) + int(there[0])
-                worst = Rail(float(ratio), visits, sign * top * (k + 0.5) / count)
+                worst = SaturationEvidence(float(ratio), visits, sign * top * (k + 0.5) / count)
     return worst
 
 
@@ -183,11 +183,11 @@ def assign_channels(
 
     upright = (unexplained(0, 0, 2, 1), unexplained(1, 1, 3, 0))
     best, best_order = np.inf, (0, 1, 2, 3)
-    # The assignment that moves the fewest channels comes first: exchanging both pairs as well is
+    # The assignment that moves the fewest channels comes first: swapping both pairs as well is
     # equally good within rounding.
     for order in sorted(permutations(range(4)), key=_moved_channels):
         s_1, s_2, u_1, u_2 = order
-        # To exchange both pairs changes neither equation: that is for `axle_correlation`.
+        # Swapping both pairs changes neither equation: that is for `axle_correlation`.
         if order in ((0, 1, 2, 3), (1, 0, 3, 2)):
             continue
         value = max(unexplained(0, s_1, u_1, s_2), unexplained(1, s_2, u_2, s_1))
@@ -346,11 +346,11 @@ def axle_correlation(
     travelled_m: FloatArray,
     wheelbase_m: float,
 ) -> tuple[float, float]:
-    """Return the correlation of both axles' motion at the same place, as recorded and exchanged.
+    """Return the correlation of both axles' motion at the same place, as recorded and swapped.
 
     Below 8 Hz an axle follows the road. `travelled_m` (n,) is the increasing distance of the front
     axle at every sample (n,); the rear axle is where the front axle was a wheelbase before. With
-    the axles exchanged, the one that is named rear is in front.
+    the axles swapped, the one that is named rear is in front.
     """
     smooth = _band_passed(np.stack([front_m_per_s2, rear_m_per_s2]), step_s, _ROAD_BAND_HZ)
     return (

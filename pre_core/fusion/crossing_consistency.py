@@ -50,29 +50,31 @@ class ConsistencyResult(NamedTuple):
 
 
 def select_consistent(
-    parts: Sequence[FusionInput], joint: JointInformation, priors: BridgePriors
+    parts: Sequence[FusionInput], information: JointInformation, priors: BridgePriors
 ) -> ConsistencyResult:
-    """Return the consistent and the excluded crossings of `joint`."""
-    names = joint.names
+    """Return the consistent and the excluded crossings of `information`."""
+    names = information.names
     if len(names) == 1:
         return ConsistencyResult(names, (), False)
     nothing_more = np.array([[0.0, 0.0, 1.0]])
-    chances = np.array(_tail_probabilities(joint, priors, names, names, nothing_more))
+    chances = np.array(_tail_probabilities(information, priors, names, names, nothing_more))
     if len(names) < _FEWEST:
         return ConsistencyResult(names, (), bool(chances.min() < _SUSPICIOUS / len(names)))
     worst = np.argsort(chances)[: len(names) // _FEWEST]
     odd = {names[i] for i in worst if chances[i] < _SUSPICIOUS / len(names)}
     if odd:
         # An outlier must not affect the estimated variability.
-        joint = build_joint(parts, priors, consistent=set(names) - odd)
+        information = build_joint(parts, priors, consistent=set(names) - odd)
     back = odd
     while odd and back:
         inside = [name for name in names if name not in odd]
-        found = variability_posterior(joint._replace(crossings=joint.select(inside)), priors)
+        found = variability_posterior(
+            information._replace(crossings=information.select(inside)), priors
+        )
         changes = np.column_stack([found.tau, found.rho, found.weight])[found.weight > _UNLIKELY]
         of = zip(
             sorted(odd),
-            _tail_probabilities(joint, priors, sorted(odd), inside, changes),
+            _tail_probabilities(information, priors, sorted(odd), inside, changes),
             strict=True,
         )
         back = {name for name, chance in of if chance >= _INCOMPATIBLE / len(names)}
@@ -82,7 +84,7 @@ def select_consistent(
 
 
 def _tail_probabilities(
-    joint: JointInformation,
+    information: JointInformation,
     priors: BridgePriors,
     names: Sequence[str],
     reference: Sequence[str],
@@ -93,14 +95,16 @@ def _tail_probabilities(
     `changes` (k, 3) are tau, rho, and their probability. A usual change, independent for each
     element, is always added, however small the variability of the others.
     """
-    elements = joint.layout.elements
-    precision, linear = posterior_information(joint, priors, joint.select(reference))
-    at = np.diag(joint.centre[elements])
+    elements = information.layout.elements
+    precision, linear = posterior_information(information, priors, information.select(reference))
+    at = np.diag(information.centre[elements])
     out = []
-    for name, one in zip(names, joint.select(names), strict=True):
+    for name, one in zip(names, information.select(names), strict=True):
         whole, pull = precision, linear
         if name not in reference:
-            whole, pull = posterior_information(joint, priors, [*joint.select(reference), one])
+            whole, pull = posterior_information(
+                information, priors, [*information.select(reference), one]
+            )
         sharp, need = _crossing_change(one, whole, pull, elements)
         chance = 0.0
         for tau, rho, weight in changes:

@@ -39,7 +39,8 @@ class CurvatureTerms(NamedTuple):
     about: FloatArray  # (b,) the bridge's coordinates at the optimum
     size: FloatArray  # (b + 1,) how far they are likely to be from there; the place last, in m
     shapes: FloatArray
-    """Terms (k, pairs) as sums of the products of two moves in these sizes, i <= j row by row."""
+    """Coefficients (k, pairs) of each term in the products u_i u_j, i <= j by rows, of moves u in
+    units of `size`."""
 
 
 def curvature_terms(

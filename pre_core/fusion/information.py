@@ -66,17 +66,17 @@ class JointInformation(NamedTuple):
 
 
 def posterior_information(
-    joint: JointInformation, priors: BridgePriors, crossings: Sequence[CrossingInformation]
+    information: JointInformation, priors: BridgePriors, crossings: Sequence[CrossingInformation]
 ) -> tuple[FloatArray, FloatArray]:
     """Return precision (n, n) and linear part (n,) of all coordinates with priors of the bridge."""
-    return add_bridge_priors(joint, priors, *sum_information(joint, crossings))
+    return add_bridge_priors(information, priors, *sum_information(information, crossings))
 
 
 def add_bridge_priors(
-    joint: JointInformation, priors: BridgePriors, precision: FloatArray, linear: FloatArray
+    information: JointInformation, priors: BridgePriors, precision: FloatArray, linear: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return a sum (n, n), (n,) of crossings with normal priors of the bridge's parameters."""
-    layout = joint.layout
+    layout = information.layout
     precision, linear = precision.copy(), linear.copy()
     single = np.arange(layout.bridge - priors.elements)
     precision[single, single] += 1.0
@@ -87,10 +87,10 @@ def add_bridge_priors(
 
 
 def sum_information(
-    joint: JointInformation, crossings: Sequence[CrossingInformation]
+    information: JointInformation, crossings: Sequence[CrossingInformation]
 ) -> tuple[FloatArray, FloatArray]:
     """Return precision (n, n) and linear part (n,) of all coordinates without bridge priors."""
-    precision, linear = joint.prior.copy(), np.zeros(joint.layout.size)
+    precision, linear = information.prior.copy(), np.zeros(information.layout.size)
     for one in crossings:
         precision[np.ix_(one.places, one.places)] += one.precision
         linear[one.places] += one.linear

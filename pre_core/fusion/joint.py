@@ -79,7 +79,7 @@ def fuse(parts: Sequence[FusionInput], priors: BridgePriors, count: int, seed: i
 
 
 def sample_joint(
-    joint: JointInformation,
+    information: JointInformation,
     priors: BridgePriors,
     count: int,
     seed: int,
@@ -87,9 +87,9 @@ def sample_joint(
     threads: int = 1,
 ) -> FusedDraws:
     """Return draws as `fuse` does; they do not depend on the number of threads."""
-    between = variability_posterior(joint, priors)
-    drawn = _draw_bridge(joint, priors, between, count, seed, report, threads)
-    return FusedDraws(*drawn, is_consistent_with_zero(between), joint.shared)
+    between = variability_posterior(information, priors)
+    drawn = _draw_bridge(information, priors, between, count, seed, report, threads)
+    return FusedDraws(*drawn, is_consistent_with_zero(between), information.shared)
 
 
 def build_joint(
@@ -114,16 +114,16 @@ def build_joint(
             )
             for part in parts
         )
-        joint = JointInformation(names, layout, crossings, prior, centre, shared)
+        information = JointInformation(names, layout, crossings, prior, centre, shared)
         # Without a change, crossings more precise than the bridge is constant would bias it.
-        of = varying_bridge(joint._replace(crossings=joint.select(consistent)))
+        of = varying_bridge(information._replace(crossings=information.select(consistent)))
         before, centre = (
             centre,
-            _most_likely(layout, priors, *marginalise_variability(joint, of, *_USUAL)[:2]),
+            _most_likely(layout, priors, *marginalise_variability(information, of, *_USUAL)[:2]),
         )
         if np.all(np.abs(centre - before) < _SETTLED):
             break
-    return joint._replace(centre=centre)
+    return information._replace(centre=centre)
 
 
 def _most_likely(
@@ -153,7 +153,7 @@ def _most_likely(
 
 
 def single_crossing_joint(part: FusionInput, priors: BridgePriors) -> JointInformation:
-    """Return one crossing as a joint, about its own estimate; its waves are its own."""
+    """Return the joint information of a single crossing, about its estimate, with its waves."""
     tracks = path_groups([part])
     layout = _layout_of([part], tracks, priors)
     centre = _nominal(layout)
@@ -263,7 +263,7 @@ def mass_sensitivity(priors: BridgePriors, centre: FloatArray) -> FloatArray:
 
 
 def _draw_bridge(
-    joint: JointInformation,
+    information: JointInformation,
     priors: BridgePriors,
     between: VariabilityPosterior,
     count: int,
@@ -276,12 +276,14 @@ def _draw_bridge(
     # Systematic sampling: the number of draws of each follows its weight.
     at = (np.arange(count) + rng.random()) / count
     chosen = np.minimum(np.searchsorted(np.cumsum(between.weight), at), between.weight.size - 1)
-    of = varying_bridge(joint)
+    of = varying_bridge(information)
     steps, taus = [], []
     for k in np.unique(chosen):
         some = int((chosen == k).sum())
         tau, rho = float(between.tau[k]), float(between.rho[k])
-        density = _posterior(joint, priors, *marginalise_variability(joint, of, tau, rho)[:2])
+        density = _posterior(
+            information, priors, *marginalise_variability(information, of, tau, rho)[:2]
+        )
         steps.append(_Step(density, some, (int(k) + 1) * CHAINS))
         taus.append(tau_draws(between, int(k), (some, CHAINS), rng))
     of_chains: list[FloatArray] = []
@@ -312,10 +314,10 @@ def _chain(steps: Sequence[_Step], seed: int, chain: int) -> FloatArray:
 
 
 def _posterior(
-    joint: JointInformation, priors: BridgePriors, precision: FloatArray, linear: FloatArray
+    information: JointInformation, priors: BridgePriors, precision: FloatArray, linear: FloatArray
 ) -> CompliancePosterior:
     """Return a sum of crossings times the priors, marginal in the bridge's coordinates."""
-    layout, of = joint.layout, priors.coordinates
+    layout, of = information.layout, priors.coordinates
     precision, linear = marginal(precision, linear, np.arange(layout.bridge))
     single = np.arange(layout.bridge - priors.elements)
     precision[single, single] += 1.0
@@ -327,6 +329,6 @@ def _posterior(
         of.scale[layout.elements],
         priors.log_odds,
         1.0,
-        joint.centre[layout.elements],
+        information.centre[layout.elements],
         np.zeros(layout.bridge),
     )

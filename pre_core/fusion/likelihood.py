@@ -50,13 +50,13 @@ KNOT_M, ALIKE_KNOT_M = 1.25, 0.5
 """
 _LONG_OF_KNOT = 0.25
 """Boundary of the long waves: about four knots. With different tyres 80 to 97 % of the information
-about a bridge lies below half of these wave numbers. Equal tyres that run on laterally shifted
+about a bridge lies below half of these frequencies. Equal tyres that run on laterally shifted
 paths leave short waves as large as long ones, so that waves of two metres are informative too."""
 _LONG_SHARE = 0.97
 """Share of the power of the longest waves; the rest stays noise of the crossing, because the
 covariance of the residuals must be positive definite."""
 _BESIDE_M = 7.5
-"""Distance before and behind the bridge over which the mismatch is correlated with that on it."""
+"""Distance before and after the bridge over which the mismatch is correlated with that on it."""
 _CUBIC = 3
 _ROUNDED = 1e-12
 OFF_BRIDGE_STEP_M = 0.25
@@ -108,7 +108,7 @@ def knot_spacing_m(mismatch: Mismatch) -> float:
 
 
 def long_share(cycles_per_m: FloatArray, knot_m: float) -> FloatArray:
-    """Return the share (g,) of the mismatch's power at wave numbers (g,) in long waves."""
+    """Return the share (g,) of the mismatch's power at spatial frequencies (g,) in long waves."""
     return np.asarray(_LONG_SHARE * np.exp(-((cycles_per_m * knot_m / _LONG_OF_KNOT) ** 2)))
 
 

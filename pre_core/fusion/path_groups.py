@@ -1,7 +1,7 @@
 """Wheel-path groups: runs of one truck in one direction, and their shared mismatch.
 
 Like the truck, the long waves of the shared part do not average out. The shared fraction follows
-from the footprints and the lateral wander of the runs, which the residuals before and behind the
+from the footprints and the lateral wander of the runs, which the residuals before and after the
 bridge determine.
 """
 
@@ -70,7 +70,7 @@ class PathGroup(NamedTuple):
     shared: SharedMismatch
     own_root: FloatArray
     whole: FloatArray
-    """Precision (q, q) of their sum, own and shared."""
+    """Precision (q, q) of the long-wave coefficients, own and shared parts together."""
     common: FloatArray | None
     """Covariance (q, q) of the shared part in mm²; None for a single run, whose waves are its own.
     """

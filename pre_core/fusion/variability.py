@@ -64,14 +64,14 @@ class VaryingBridge(NamedTuple):
     alike: tuple[_SameLayout, ...]
 
 
-def varying_bridge(joint: JointInformation) -> VaryingBridge:
-    """Return the crossings of `joint`, grouped by coordinates."""
-    elements = joint.layout.elements
+def varying_bridge(information: JointInformation) -> VaryingBridge:
+    """Return the crossings of `information`, grouped by coordinates."""
+    elements = information.layout.elements
     alike: dict[bytes, list[CrossingInformation]] = {}
-    for one in joint.crossings:
+    for one in information.crossings:
         alike.setdefault(one.places.tobytes(), []).append(one)
     return VaryingBridge(
-        *sum_information(joint, joint.crossings),
+        *sum_information(information, information.crossings),
         tuple(
             _SameLayout(
                 some[0].places,
@@ -84,7 +84,7 @@ def varying_bridge(joint: JointInformation) -> VaryingBridge:
 
 
 def marginalise_variability(
-    joint: JointInformation, bridge: VaryingBridge, tau: float, rho: float
+    information: JointInformation, bridge: VaryingBridge, tau: float, rho: float
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return precision (n, n) and linear part (n,) of all coordinates if the bridge varies.
 
@@ -92,10 +92,10 @@ def marginalise_variability(
     """
     if tau == 0.0:
         return bridge.precision, bridge.linear, 0.0
-    elements = joint.layout.elements
+    elements = information.layout.elements
     e = elements.size
     root = np.linalg.cholesky((1.0 - rho) * np.eye(e) + rho) * tau
-    root = joint.centre[elements][:, None] * root
+    root = information.centre[elements][:, None] * root
     precision, linear, evidence = bridge.precision.copy(), bridge.linear.copy(), 0.0
     for some in bridge.alike:
         across = root.T @ some.across
@@ -110,14 +110,18 @@ def marginalise_variability(
     return precision, linear, evidence
 
 
-def variability_posterior(joint: JointInformation, priors: BridgePriors) -> VariabilityPosterior:
+def variability_posterior(
+    information: JointInformation, priors: BridgePriors
+) -> VariabilityPosterior:
     """Return the posterior of tau and rho; for one crossing it is the prior."""
     tau, rho = (grid.ravel() for grid in np.meshgrid(_TAUS, _RHOS, indexing="ij"))
     log = np.empty(tau.size)
-    of = varying_bridge(joint)
+    of = varying_bridge(information)
     for k in range(tau.size):
-        precision, linear, log[k] = marginalise_variability(joint, of, float(tau[k]), float(rho[k]))
-        precision, linear = add_bridge_priors(joint, priors, precision, linear)
+        precision, linear, log[k] = marginalise_variability(
+            information, of, float(tau[k]), float(rho[k])
+        )
+        precision, linear = add_bridge_priors(information, priors, precision, linear)
         factor = np.linalg.cholesky(precision)
         at = np.linalg.solve(factor, linear)
         log[k] += 0.5 * float(at @ at) - float(np.log(np.diag(factor)).sum())

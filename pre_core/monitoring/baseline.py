@@ -3,14 +3,14 @@
 Every period has an observation y of ln EI with own covariance R and loadings K on unit normals z
 that it shares with other periods (trucks, wheel-path groups, the other bridge parameters):
 
-    y = mu + beta (T - T_0) + wander + K z + own + change,
-    change ~ N(0, q^2 C),    wander: Ornstein-Uhlenbeck, standard deviation s, correlation time tau,
+    y = mu + beta (T - T_0) + drift + K z + own + change,
+    change ~ N(0, q^2 C),    drift: Ornstein-Uhlenbeck, standard deviation s, correlation time T_c,
 
 with C = (1 - rho) I + rho 1 1'. Without a temperature, beta (T - T_0) is replaced by an annual wave
 of unknown amplitude and phase in each element, a semi-annual one and an offset common to all, and
 the weather's deviation from it as noise.
 
-mu, beta, wander, season and z are one normal state of a Kalman filter. q, s and tau are unknown:
+mu, beta, drift, season and z are one normal state of a Kalman filter. q, s and T_c are unknown:
 the filter runs for each of `scales_compared()` at once, and the weight of each run is its prior
 times the density of the observations. Innovations of an unchanged bridge are independent even if
 periods share errors, because the prediction contains the shared part.
@@ -39,12 +39,12 @@ half-annual wave, of the annual mean, and of a period's weather."""
 DAYS_PER_YEAR = 365.25
 CHANGES = (0.0, 0.005, 0.015, 0.04)
 """Grid of q; half-normal prior of scale 4 %, as between crossings."""
-WANDERS = (0.0, 0.006, 0.012, 0.02)
+DRIFTS = (0.0, 0.006, 0.012, 0.02)
 """Grid of s; larger values would explain a slow loss."""
-WANDER_SCALE = 0.012
+DRIFT_SCALE = 0.012
 """Scale of the half-normal prior of s."""
-MEMORIES_DAYS = (56.0, 280.0)
-"""Grid of tau, equally likely."""
+CORRELATIONS_DAYS = (56.0, 280.0)
+"""Grid of T_c, equally likely."""
 COMMON_CHANGE = 0.5
 """Correlation rho of the changes of two elements."""
 _NEGLIGIBLE = 0.01
@@ -65,10 +65,10 @@ class Scales(NamedTuple):
 
     change: FloatArray
     """Values of q."""
-    wander: FloatArray
+    drift: FloatArray
     """Values of s."""
-    memory_days: FloatArray
-    """Values of tau."""
+    correlation_days: FloatArray
+    """Values of T_c."""
     log_prior: FloatArray
 
 
@@ -80,7 +80,7 @@ class BaselineState(NamedTuple):
     log_weight: FloatArray
     """Logarithm (m,) of the posterior weight, normalised."""
     places: Mapping[str, slice]
-    """Position of each variable: level, wander, slope, season, change, and the names of shared
+    """Position of each variable: level, drift, slope, season, change, and the names of shared
     errors."""
     scales: Scales
     time_days: float
@@ -96,17 +96,19 @@ class Innovation(NamedTuple):
 
 
 def scales_compared() -> Scales:
-    """Return the grid of q, s and tau with its prior."""
-    wanders = [(0.0, MEMORIES_DAYS[0], 1.0)]
-    wanders += [(s, tau, 1.0 / len(MEMORIES_DAYS)) for s in WANDERS[1:] for tau in MEMORIES_DAYS]
+    """Return the grid of q, s and T_c with its prior."""
+    drifts = [(0.0, CORRELATIONS_DAYS[0], 1.0)]
+    drifts += [
+        (s, days, 1.0 / len(CORRELATIONS_DAYS)) for s in DRIFTS[1:] for days in CORRELATIONS_DAYS
+    ]
     widths_q = dict(zip(CHANGES, np.gradient(np.array(CHANGES)), strict=True))
-    widths_s = dict(zip(WANDERS, np.gradient(np.array(WANDERS)), strict=True))
+    widths_s = dict(zip(DRIFTS, np.gradient(np.array(DRIFTS)), strict=True))
     rows = np.array(
         [
-            (q, s, tau, np.log(share * widths_q[q] * widths_s[s])
-             - 0.5 * (q / BETWEEN_SCALE) ** 2 - 0.5 * (s / WANDER_SCALE) ** 2)
+            (q, s, days, np.log(share * widths_q[q] * widths_s[s])
+             - 0.5 * (q / BETWEEN_SCALE) ** 2 - 0.5 * (s / DRIFT_SCALE) ** 2)
             for q in CHANGES
-            for s, tau, share in wanders
+            for s, days, share in drifts
         ]
     )  # fmt: skip
     log_prior = rows[:, 3] - log_sum(rows[:, 3])
@@ -116,7 +118,7 @@ def scales_compared() -> Scales:
 def initial_baseline(periods: Sequence[Period], scales: Scales) -> BaselineState:
     """Return the state before the first of some periods, with all variables that they need."""
     n, m = periods[0].observation.value.size, scales.change.size
-    blocks: dict[str, FloatArray] = {"level": LEVEL_SPREAD**2 * np.eye(n), "wander": _alike(n)}
+    blocks: dict[str, FloatArray] = {"level": LEVEL_SPREAD**2 * np.eye(n), "drift": _alike(n)}
     if any(period.temperature_deg_c is not None for period in periods):
         blocks["slope"] = _of_slope(n)
     if any(period.temperature_deg_c is None for period in periods):
@@ -134,7 +136,7 @@ def initial_baseline(periods: Sequence[Period], scales: Scales) -> BaselineState
         size += len(block)
     covariance = np.zeros((m, size, size))
     for name, block in blocks.items():
-        factor = scales.wander**2 if name == "wander" else np.ones(m)
+        factor = scales.drift**2 if name == "drift" else np.ones(m)
         covariance[:, places[name], places[name]] = factor[:, None, None] * block
     mean = np.zeros((m, size))
     mean[:, :n] = periods[0].observation.value
@@ -142,15 +144,15 @@ def initial_baseline(periods: Sequence[Period], scales: Scales) -> BaselineState
 
 
 def predict_state(state: BaselineState, time_days: float) -> tuple[BaselineState, FloatArray]:
-    """Return the state at a later time, and the remaining share (m,) of the wander."""
+    """Return the state at a later time, and the remaining share (m,) of the drift."""
     passed = max(0.0, time_days - state.time_days)
-    kept = np.exp(-passed / state.scales.memory_days)
-    at = state.places["wander"]
+    kept = np.exp(-passed / state.scales.correlation_days)
+    at = state.places["drift"]
     mean, covariance = state.mean.copy(), state.covariance.copy()
     mean[:, at] *= kept[:, None]
     covariance[:, at, :] *= kept[:, None, None]
     covariance[:, :, at] *= kept[:, None, None]
-    anew = state.scales.wander**2 * (1.0 - kept**2)
+    anew = state.scales.drift**2 * (1.0 - kept**2)
     covariance[:, at, at] += anew[:, None, None] * _alike(at.stop - at.start)
     return state._replace(mean=mean, covariance=covariance, time_days=time_days), kept
 
@@ -288,7 +290,7 @@ def _rows(state: BaselineState, period: Period) -> tuple[FloatArray, FloatArray]
     n = of.value.size
     across = np.zeros((n, state.mean.shape[1]))
     noise = of.own
-    for name in ("level", "wander", _CHANGE):
+    for name in ("level", "drift", _CHANGE):
         if name in state.places:
             across[:, state.places[name]] = np.eye(n)
     if period.temperature_deg_c is not None:

@@ -109,9 +109,9 @@ class MonitoringResult(NamedTuple):
     threshold: float
     """Threshold of the statistic."""
     usual_change: float
-    """Root mean square of q, of ln EI."""
-    usual_wander: float
-    """Root mean square of the slow component."""
+    """Posterior root mean square of q, the standard deviation of ln EI between periods."""
+    usual_drift: float
+    """Posterior root mean square of s, the standard deviation of the slow drift of ln EI."""
     change: Change | None
     """The first change that was not acknowledged."""
 
@@ -171,14 +171,14 @@ def detect_change(
             innovation = filter_step(state, period)
             rows[number] = standardised(state, innovation)
             inflation = max(1.0, (np.abs(rows[number]).max() / MAX_STANDARDISED) ** 2)
-            wander = state.places["wander"]
+            drift = state.places["drift"]
             weight: FloatArray | None = None
             if is_judged[number]:
                 # An outlier would move the baseline, and sound periods would pass for a change.
                 after = state
                 if inflation == 1.0:
                     after, weight = update_state(state, innovation)
-                chart = update_chart(chart, number, kept, wander, weight, innovation, inflation)
+                chart = update_chart(chart, number, kept, drift, weight, innovation, inflation)
                 state = after
                 ratio, _ = log_ratio(chart, state, number)
                 statistic[number] = _in_deviations(ratio)
@@ -190,7 +190,7 @@ def detect_change(
             else:
                 wider = innovation._replace(covariance=inflation * innovation.covariance)
                 state, weight = update_state(state, wider)
-                chart = skip_period(chart, kept, wander, weight, innovation)
+                chart = skip_period(chart, kept, drift, weight, innovation)
             likely = state.log_weight > np.log(_UNLIKELY)
             if likely.mean() < _WORTHWHILE:
                 state, chart = select_scales(state, likely), select_chart_scales(chart, likely)
@@ -252,7 +252,7 @@ def _usual(state: BaselineState) -> tuple[float, float]:
     weight = np.exp(state.log_weight)
     return (
         float(np.sqrt(weight @ state.scales.change**2)),
-        float(np.sqrt(weight @ state.scales.wander**2)),
+        float(np.sqrt(weight @ state.scales.drift**2)),
     )
 
 

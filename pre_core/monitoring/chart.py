@@ -74,24 +74,24 @@ def select_chart_scales(chart: Chart, kept: NDArray[np.bool_]) -> Chart:
 
 
 def skip_period(
-    chart: Chart, kept: FloatArray, wander: slice, weight: FloatArray, innovation: Innovation
+    chart: Chart, kept: FloatArray, drift: slice, weight: FloatArray, innovation: Innovation
 ) -> Chart:
     """Return the chart after a period that is not tested; `kept` (m,), `weight` (m, size, n)."""
-    return chart._replace(response=_responded(chart, kept, wander, weight, innovation)[0])
+    return chart._replace(response=_responded(chart, kept, drift, weight, innovation)[0])
 
 
 def update_chart(
     chart: Chart,
     number: int,
     kept: FloatArray,
-    wander: slice,
+    drift: slice,
     weight: FloatArray | None,
     innovation: Innovation,
     inflation: float,
 ) -> Chart:
     """Return the chart after a period.
 
-    `number` is the period's, `kept` (m,) the remaining share of the wander since the previous one,
+    `number` is the period's, `kept` (m,) the remaining share of the drift since the previous one,
     `weight` (m, size, n) the Kalman gain (None without an update), `inflation` the factor of the
     innovation's covariance.
     """
@@ -103,7 +103,7 @@ def update_chart(
         np.concatenate([chart.score, np.zeros((m, 1, n))], axis=1),
     )
     c = len(chart.begins)
-    response, shown = _responded(chart, kept, wander, weight, innovation)
+    response, shown = _responded(chart, kept, drift, weight, innovation)
     flat = shown.reshape(m, n, c * n)
     covariance = inflation * innovation.covariance
     solved = np.linalg.solve(
@@ -126,14 +126,14 @@ def update_chart(
 def _responded(
     chart: Chart,
     kept: FloatArray,
-    wander: slice,
+    drift: slice,
     weight: FloatArray | None,
     innovation: Innovation,
 ) -> tuple[FloatArray, FloatArray]:
     """Return F after a period, and G (m, n, c, n)."""
     m, size, c, n = chart.response.shape
     before = chart.response.copy()
-    before[:, wander] *= kept[:, None, None, None]
+    before[:, drift] *= kept[:, None, None, None]
     shown = -(innovation.across @ before.reshape(m, size, c * n)).reshape(m, n, c, n)
     shown += np.eye(n)[:, None, :]
     if weight is not None:

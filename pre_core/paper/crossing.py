@@ -27,7 +27,7 @@ def paper_window(
 ) -> PaperWindow:
     """Simulate the paper's experiment (Table 4), optionally with white sensor noise.
 
-    `noise` is one-sided, in µg/√Hz; `road` is an ISO 8608 class and the seed of its phases. Raise
+    `noise_ug_per_rthz` is one-sided; `road` is an ISO 8608 class and the seed of its phases. Raise
     ArithmeticError if the forces do not converge.
     """
     span = float(beam.element_lengths_m.sum())

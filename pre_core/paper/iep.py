@@ -27,7 +27,7 @@ def iep_signals(
 ) -> FloatArray:
     """Return the four signals of each wheel: (2, 4, n) z_u, z''_u, z'_u - z'_s, z_u - z_s.
 
-    `acceleration` is (4, n): sprung front, sprung rear, unsprung front, unsprung rear.
+    `acceleration_m_per_s2` is (4, n): sprung front, sprung rear, unsprung front, unsprung rear.
     """
     velocity, displacement = integrate(acceleration_m_per_s2, step_s)
     sprung, unsprung = slice(0, 2), slice(2, 4)

@@ -128,11 +128,11 @@ def build_window(
 ) -> PaperWindow:
     """Prepare one crossing.
 
-    `acceleration` (4, N) and `front_position` (N,) are evenly spaced in time by `step_s`;
-    `direction` is 1 driving from start to end, else -1. With `initial_state_known` the truck was at
-    rest at the first sample, as in the paper; otherwise the effect of unknown initial displacement
-    and velocity (and, unless `bias_known`, constant bias) is projected out of the residual. `parts`
-    and `coordinates` refine the beam (see `beam_basis`); the defaults are the paper's mesh.
+    `acceleration_m_per_s2` (4, N) and `front_position_m` (N,) are evenly spaced in time by
+    `step_s`; `direction` is 1 driving from start to end, else -1. With `initial_state_known` the
+    truck was at rest at the first sample, as in the paper; otherwise the effect of unknown initial
+    displacement and velocity (and, unless `bias_known`, constant bias) is projected out of the
+    residual. `parts` and `coordinates` refine the beam (see `beam_basis`); defaults: the paper's.
 
     Raise WindowError if the samples do not reach from the entry to the exit.
     """

@@ -2,7 +2,7 @@
 
 A tyre averages the road over its width and contact length, an axle over its two wheel tracks, twin
 tyres over two strips each. On an isotropic random surface with the one-sided spectrum Phi(k), k the
-wave number in any direction, an axle multiplies the wave (n_x, n_y) by
+spatial frequency in cycles/m in any direction, an axle multiplies the wave (n_x, n_y) by
 
     H = sinc(width n_y) sinc(length n_x) cos(pi track n_y) cos(pi twins n_y) exp(2 pi i offset n_y)
 
@@ -22,13 +22,13 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _WIDEST_CYCLES_PER_M = 40.0
-"""Largest lateral wave number; tyres average shorter waves out."""
+"""Largest lateral frequency in cycles/m; tyres average shorter waves out."""
 _AT_ONCE = 32  # waves along whose amplitudes are drawn at once
 _ACROSS, _FINE = 400, 4000
 """Number of lateral waves: of a drawn surface, and of the integral to one side."""
 _SHORTEST_WAVE_M, _LONGEST_WAVE_M = 0.05, 100.0
 _SCALE = 0.02
-"""Lateral wave number in cycles/m above which waves are spaced proportionally."""
+"""Lateral frequency in cycles/m above which waves are spaced proportionally."""
 _STEP = float(np.arcsinh(_WIDEST_CYCLES_PER_M / _SCALE)) / _FINE
 
 

@@ -1,8 +1,8 @@
-"""Uniform St. Venant torsion of the deck under wheels on an eccentric lane.
+"""Uniform St. Venant torsion of the deck under wheels off its axis.
 
 A deck of torsional rigidity GJ whose twist is fixed at every support rotates by theta under the
-moment e P of a wheel pair at the lateral distance e of its middle from the axis, and the middle of
-that axle sinks by e theta. Only g = e²/(GJ) affects the motion of an axle's middle:
+moment e P of a wheel pair whose centre is at the lateral distance e from the axis, and the centre
+of that axle sinks by e theta. Only g = e²/(GJ) affects the motion of an axle's centre:
 
     y(x) = g G(x, x') P,   G(x, x') = (min(x, x') - a) (b - max(x, x')) / (b - a)
 
@@ -12,7 +12,7 @@ the rotational inertia of a metre of deck. The lowest `MODES` of each span are m
 (modal_response.py); the others respond quasi-statically (`flexibility_remainder`).
 
 Torsion and bending are independent, as in a deck that is symmetric about its axis, and the axis is
-the middle between the ends given in the site file.
+the line between the ends given in the site file.
 """
 
 from typing import Final, NamedTuple
@@ -28,7 +28,7 @@ from pre_core.physics.modal_response import COEFFICIENTS, mode_coefficients
 FloatArray = NDArray[np.float64]
 
 GROUPS = 2
-"""Number of lane groups for each span."""
+"""Number of groups of `LANES` modes for each span, one mode in each vector lane."""
 MODES = GROUPS * LANES
 """Number of dynamic modes of each span."""
 
@@ -102,7 +102,7 @@ def torsion_filters(
     cubics: FloatArray,
     feedback: FloatArray,
 ) -> bool:
-    """Write the torsional modes of `theta` (p,) into the last lane groups, one for each span.
+    """Write the torsional modes of `theta` (p,) into the last groups, `GROUPS` for each span.
 
     The form is that of `modal_response.modal_filters`: `cubics` (parts, groups, 4, 4) and
     `feedback` (groups, 5, 4). Return False if not finite.

@@ -23,27 +23,27 @@ _GIVE_UP_DAMPING = 1e8
 """Damping at which the search is stuck: very short steps do not help."""
 _CONVERGED_STEP = 1e-9  # in logarithms
 _KEPT = 0.5
-"""Smallest gain relative to the prediction of an updated Jacobian before it is recomputed."""
-_MISFIT_GAIN = 1e-3
-"""Gain relative to the objective that ends the search at a misfit."""
+"""Smallest improvement, relative to its prediction, for which an updated Jacobian is kept."""
+_MISFIT_IMPROVEMENT = 1e-3
+"""Improvement relative to the objective that ends the search at a misfit."""
 _LARGEST_STEP = 1.0  # in logarithms: nothing changes by more than a factor of e in one step
 
 
 class DifferenceScheme(NamedTuple):
-    """Scheme of a Jacobian, and the gain at which a search that uses it has converged."""
+    """Scheme of a Jacobian, and the improvement at which a search that uses it has converged."""
 
     step: float  # in search coordinates
     central: bool
-    converged_gain: float  # relative decrease of J that the linear model still predicts
+    converged_improvement: float  # relative decrease of J that the linear model still predicts
     rounding: float  # a smaller relative rise of J is rounding and does not reject a step
 
 
-FORWARD = DifferenceScheme(1e-6, central=False, converged_gain=1e-7, rounding=0.0)
+FORWARD = DifferenceScheme(1e-6, central=False, converged_improvement=1e-7, rounding=0.0)
 """Scheme during the search: f evaluations, six digits. The other digits depend on the processor's
 rounding and move the optimum by about 1e-6, little compared with a standard deviation of any real
 crossing."""
 
-CENTRAL = DifferenceScheme(1e-3, central=True, converged_gain=1e-12, rounding=1e-9)
+CENTRAL = DifferenceScheme(1e-3, central=True, converged_improvement=1e-12, rounding=1e-9)
 """Scheme at the optimum: 2f evaluations, a rounding a thousand times smaller. The formula's error
 is larger, about 2e-5 of a standard deviation, but the same on every processor: so is the optimum.
 Uncertainties (`gauss_newton_covariance`) use `sixth_order_jacobian`."""
@@ -120,8 +120,8 @@ def trial_step(
     scale[scale == 0.0] = 1.0
     rows_of[:, :count] /= scale
     triangle, projected = _triangle(rows_of)
-    # If even the full linear step predicts next to no gain, the search has converged.
-    if _square(projected) <= state.differences.converged_gain * state.objective:
+    # If even the full linear step predicts next to no improvement, the search has converged.
+    if _square(projected) <= state.differences.converged_improvement * state.objective:
         return state, LMInfo(state.objective, 0.0, state.damping, False, 0, Termination.CONVERGED)
     damping = state.damping
     evaluations = 0
@@ -171,7 +171,7 @@ def _follow(rows: Rows, state: LMState, lower: FloatArray | None) -> tuple[LMSta
     """Take a step as `descend` does, updating the Jacobian as long as steps succeed.
 
     Broyden's update (Dennis and Schnabel, section 8.1) is the nearest Jacobian that explains the
-    change of the residuals along the step. It is recomputed where a step gains too little of its
+    change of the residuals along the step. It is recomputed where a step achieves too little of its
     prediction, and where a step with an updated Jacobian fails.
     """
     there = trial_step(rows, state, lower)
@@ -271,14 +271,14 @@ def minimise(
     is_followed: bool = False,
     misfit: float = np.inf,
 ) -> SearchResult[LMState, LMInfo]:
-    """Return the minimum near `start` (f,), reached when a step gains less than `enough`.
+    """Return the minimum near `start` (f,), reached when a step improves by less than `enough`.
 
-    Where the mean square of the residuals exceeds `misfit`, a gain of less than a thousandth of the
-    objective also ends the search: its exact minimum is of no use.
-    Where no step helps, forward differences have reached their rounding: a minimum too. With
-    `is_followed` the Jacobian is computed at the start, and then only where updates (`_follow`)
-    fail. A step that gains too little ends the search only with a fresh Jacobian. The Jacobian at
-    the end need not be fresh (`LMState.is_fresh`). No coordinate goes below `lower` (f,).
+    Where the mean square of the residuals exceeds `misfit`, an improvement by less than a
+    thousandth of the objective also ends the search: its exact minimum is of no use. Where no step
+    helps, forward differences have reached their rounding: a minimum too. With `is_followed` the
+    Jacobian is computed at the start, and then only where updates (`_follow`) fail. A step that
+    improves too little ends the search only with a fresh Jacobian. The Jacobian at the end need not
+    be fresh (`LMState.is_fresh`). No coordinate goes below `lower` (f,).
     """
 
     def step(state: LMState) -> tuple[LMState, LMInfo]:
@@ -286,7 +286,7 @@ def minimise(
         if info.ending is Termination.STUCK:
             return following, info._replace(ending=Termination.CONVERGED)
         is_misfit = following.objective > misfit * state.residual.size
-        least = max(enough, _MISFIT_GAIN * state.objective) if is_misfit else enough
+        least = max(enough, _MISFIT_IMPROVEMENT * state.objective) if is_misfit else enough
         if info.ending is None and state.objective - following.objective < least:
             if state.is_fresh:
                 return following, info._replace(ending=Termination.CONVERGED)

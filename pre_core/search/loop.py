@@ -55,7 +55,7 @@ def run_search(
     at_the_end: Termination = Termination.STEPS_EXHAUSTED,
     progress: Callable[[int, InfoT], None] | None = None,
 ) -> SearchResult[StateT, InfoT]:
-    """Step until a method ends, or `max_steps` are taken (`at_the_end`)."""
+    """Run `step` until the method ends, or end with `at_the_end` after `max_steps` steps."""
     state = init()
     infos: list[InfoT] = []
     for count in range(1, max_steps + 1):

@@ -101,7 +101,7 @@ def planned_path_group(
 
 
 def _crossing_likelihood(truth: PosteriorAtTruth, whole: Mismatch) -> CrossingLikelihood:
-    """Return the likelihood of one crossing, the only part of `fusion` that this room needs."""
+    """Return the likelihood of one crossing, the only part of `fusion` that this package needs."""
     problem, y = truth
     mismatch = whole._replace(speed_m_per_s=problem.mismatch.speed_m_per_s)
     problem = problem._replace(mismatch=mismatch)

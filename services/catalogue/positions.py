@@ -33,7 +33,7 @@ _FASTEST_M_PER_S: Final = 60.0
 _METRES_PER_DEGREE: Final = 110_500.0
 """Length of a degree of latitude, at least, in m."""
 _AROUND_NS: Final = round((2.0 * AWAY_S + 10.0) * NS_PER_S)
-"""Time read before and behind a stay near a bridge, as the detection of stays needs it."""
+"""Time read before and after a stay near a bridge, as the detection of stays needs it."""
 _Truck = tuple[str, str]
 """Realm and vehicle."""
 _Span = tuple[int, int]

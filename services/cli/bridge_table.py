@@ -31,7 +31,7 @@ def print_bridge(console: "Console", bridge: BridgeElements, state: BridgeResult
     used, left = len(state.crossings_used), state.crossings_left_out_count
     console.print(
         f"[bold]{bridge.id}[/], {used} crossing{'' if used == 1 else 's'} together"
-        + (f", {left} left out" if left else ""),
+        + (f", {left} excluded" if left else ""),
         highlight=False,
     )
     for one in state.crossings_left_out:
@@ -57,7 +57,10 @@ def _of_state(state: BridgeResult) -> Iterator[str]:
     if state.level is not None and state.thirds is not None:
         thirds = (state.thirds.left, state.thirds.middle, state.thirds.right)
         parts = ", ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
-        yield f"EI / nominal: mean {state.level.mean:.2f} ± {state.level.std:.2f}; thirds {parts}"
+        yield (
+            f"overall stiffness: {state.level.mean:.2f} ± {state.level.std:.2f} of nominal; "
+            f"thirds {parts}"
+        )
     if state.between_crossing_std is not None and len(state.crossings_used) == 1:
         yield (
             "single crossing: intervals include the between-crossing variability, which one "
@@ -70,10 +73,10 @@ def _of_state(state: BridgeResult) -> Iterator[str]:
             f"{100.0 * (low or 0.0):.1f} to {100.0 * (high or 0.0):.1f} %"
         )
     for track in state.tracks:
-        beside = "" if track.wander_m is None else f", {track.wander_m:.2f} m beside each other"
+        wander = "" if track.wander_m is None else f", lateral wander {track.wander_m:.2f} m"
         yield (
-            f"runs of {track.vehicle}, {track.direction.replace('_', ' ')}{beside}: "
-            f"{100.0 * track.common_share:.0f} % of the profile mismatch is the same in every run"
+            f"wheel-path group of {track.vehicle}, {track.direction.replace('_', ' ')}{wander}: "
+            f"{100.0 * track.common_share:.0f} % of the profile mismatch is common to all runs"
         )
 
 

@@ -195,7 +195,7 @@ def _write_rerun(
     from services.viewer.vehicle_signals import signals_of_messages
 
     messages = chain.from_iterable(map(read_messages, recordings))
-    with steps_bar("what fits leave over", console) as progress:
+    with steps_bar("computing residuals", console) as progress:
         left = residual_cells(found.crossings, messages, site, progress)
     with reading_bar("reading", recordings, console) as next_file:
         vehicles = signals_of_messages(
@@ -217,7 +217,7 @@ def _crossings_seen(recordings: list[Path], site: Site, console: "Console") -> i
     """Return the number of crossings for a progress bar; 0 without a terminal."""
     if not console.is_terminal:
         return 0
-    with reading_bar("looking for crossings", recordings, console) as next_file:
+    with reading_bar("searching for crossings", recordings, console) as next_file:
         return sum(
             len(summarise_recording(path, site, progress=next_file()).passings)
             for path in recordings
@@ -314,7 +314,7 @@ def _level_lines(crossing: CrossingResult) -> Iterator[str]:
         thirds = (derived.ei_thirds.left, derived.ei_thirds.middle, derived.ei_thirds.right)
         parts = ", ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
         level = derived.ei_level
-        yield f"EI / nominal: mean {level.mean:.2f} ± {level.std:.2f}; thirds {parts}"
+        yield f"overall stiffness: {level.mean:.2f} ± {level.std:.2f} of nominal; thirds {parts}"
     if crossing.road is not None and crossing.road.mismatch is not None:
         mismatch = crossing.road.mismatch
         yield (
@@ -333,7 +333,7 @@ def _fit_lines(crossing: CrossingResult) -> Iterator[str]:
     diagnostics = crossing.diagnostics
     if crossing.scale_error is not None:
         yield (
-            f"common to all elements: {100.0 * crossing.scale_error:.1f} % "
+            f"common scale uncertainty: {100.0 * crossing.scale_error:.1f} % "
             "(standard deviation; mass, gain)"
         )
     if crossing.chi2_per_dof is not None:
@@ -347,8 +347,8 @@ def _fit_lines(crossing: CrossingResult) -> Iterator[str]:
         yield from _support_lines(crossing.derived, torsion_declared=declared)
     if "relative_misfit" in diagnostics:
         yield (
-            f"the two roads differ by {diagnostics['residual_rms_m'] * 1e6:.2f} µm rms, "
-            f"{100.0 * diagnostics['relative_misfit']:.2g} % of the road"
+            f"the two road profiles differ by {diagnostics['residual_rms_m'] * 1e6:.2f} µm rms, "
+            f"{100.0 * diagnostics['relative_misfit']:.2g} % of the profile"
         )
     if "seconds" in diagnostics:
         yield f"{diagnostics['seconds']:.1f} s"

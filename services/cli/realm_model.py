@@ -81,7 +81,7 @@ class CrossingRow(NamedTuple):
     ratios: tuple[float, ...] = ()
     """EI of each element over nominal."""
     weak: frozenset[int] = frozenset()
-    """Numbers of the elements that are clearly weaker than the others."""
+    """Numbers of the elements that are clearly less stiff than the others."""
     lowest: LowestElement | None = None
     reason: str = ""
     """Codes of its reasons."""
@@ -93,7 +93,7 @@ class CrossingRow(NamedTuple):
 
 
 class BridgeRow(NamedTuple):
-    """One bridge, by all crossings up to now."""
+    """One bridge, from all crossings up to now."""
 
     used: int
     verdict: str

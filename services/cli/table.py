@@ -75,7 +75,7 @@ COMMANDS: Final[Mapping[str, ListedCommand]] = {
         _IDENTIFY,
         {"figures": _VIEW},
     ),
-    "recover": ListedCommand("rewrite a damaged or truncated recording"),
+    "recover": ListedCommand("recover a damaged or truncated recording into a new file"),
     "view": ListedCommand(
         "open a recording, a result or the live bus in the Rerun viewer", ("identify", "view")
     ),
@@ -84,7 +84,7 @@ COMMANDS: Final[Mapping[str, ListedCommand]] = {
     ),
     "logger": ListedCommand("record all messages of a realm and host the bus router"),
     "worker": ListedCommand("identify crossings as they happen and publish the results", _IDENTIFY),
-    "truck": ListedCommand("publish a recording as a truck that drives now"),
+    "truck": ListedCommand("publish a recording as if the truck were driving now"),
     "gateway": ListedCommand("publish the data of a ROS 2 truck on the bus", ("ros2",)),
     "replay": ListedCommand("publish recorded messages again, unchanged, in a realm of their own"),
     "watch": ListedCommand("show trucks, crossings and results in the terminal as they arrive"),

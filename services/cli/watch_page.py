@@ -161,8 +161,8 @@ def _late_sample_notes(trucks: Sequence[tuple[str, TruckRow]], realm: str) -> li
     old = [name for name, truck in trucks if truck.lag_s > _OLD_S]
     if not old or is_from_recording(realm):
         return []
-    why = "played faster than real, sent late, or a clock is off"
-    said = f"  {', '.join(old[:3])}: samples are old when they come: {why}"
+    why = "replayed faster than real time, sent late, or a clock is wrong"
+    said = f"  {', '.join(old[:3])}: samples are old on arrival: {why}"
     return [Text(said, style="yellow", no_wrap=True, overflow="ellipsis")]
 
 
@@ -197,7 +197,7 @@ def _crossings(rows: Sequence[CrossingRow], *, is_wide: bool) -> Table:
 
 def _bridges(bridges: dict[str, BridgeRow], standing: Set[str]) -> Table:
     """Return the bridges: with a standing alarm first, then by the latest message."""
-    table = _table("bridge", "crossings", "EI", "by all crossings")
+    table = _table("bridge", "crossings", "EI", "all crossings fused")
     alarmed = [name for name in bridges if name in standing][-_MAX_BRIDGES:]
     quiet = [name for name in bridges if name not in standing]
     for name in (*alarmed, *quiet[max(0, len(quiet) + len(alarmed) - _MAX_BRIDGES) :]):

@@ -70,10 +70,11 @@ class Language(NamedTuple):
         if self.reasons is REASON_TEXTS:
             return stored
         sentence = self.reasons[code]
-        plain = REASON_TEXTS[Reason(code)].removesuffix(".") + ": "
-        if not stored.startswith(plain):
+        # An older version's sentence has other words, and its details behind as many colons.
+        parts = stored.split(": ", REASON_TEXTS[Reason(code)].count(": ") + 1)
+        if len(parts) < REASON_TEXTS[Reason(code)].count(": ") + 2:
             return sentence
-        details = stored.removeprefix(plain)
+        details = parts[-1]
         for english, own in self.details.items():
             details = details.replace(english, own)
         return f"{sentence.removesuffix('.')}: {details}"

@@ -93,8 +93,9 @@ def site_option(text: str, *, group: str = "", required: bool = False) -> Any:
 
 def speed_option(default: float, *, zero: str = "", group: str = "") -> Any:
     """Return `--speed` as a multiple of the original one; `zero` explains the value 0."""
+    what = f"playback speed as a multiple of real time{', ' + zero if zero else ''}"
     return opt(
-        f"speed over real time{', ' + zero if zero else ''} (default: {default:g})",
+        f"{what} (default: {default:g})",
         number("a factor", low=0 if zero else 1e-3, high=1e6),
         default=default,
         group=group,

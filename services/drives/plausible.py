@@ -80,8 +80,8 @@ def _check_coordinates(run: Run, site: Site) -> None:
     read = judged.coordinates(latitude, longitude, site, None)
     if read.distance_m >= judged.NEAR_M:
         return
-    if read.is_exchanged:
-        problem = "latitude_deg and longitude_deg of its positions are exchanged"
+    if read.is_swapped:
+        problem = "latitude_deg and longitude_deg of its positions are swapped"
     elif read.unit != "deg":
         problem = f"its positions are in {read.unit}, not in degrees"
     else:
@@ -128,7 +128,7 @@ def _strange(run: Run, site: Site) -> Iterator[str]:
     for end in ("front", "rear"):
         body, axle = run.channels.get(f"sprung_{end}"), run.channels.get(f"unsprung_{end}")
         if body is not None and axle is not None and np.std(body) > 2.0 * np.std(axle) > 0.0:
-            yield f"the {end} body shakes more than its axle: are the two columns exchanged?"
+            yield f"the {end} body shakes more than its axle: are the two columns swapped?"
     if np.nanmax(np.abs(run.gnss.altitude_m), initial=0.0) > _HIGHEST_M:
         yield f"altitudes reach {np.nanmax(run.gnss.altitude_m):g} m: in another unit?"
     note = clock_note(run.accel_time_s, run.gnss.time_s)

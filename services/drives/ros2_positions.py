@@ -21,7 +21,7 @@ In a burst all messages of one topic may arrive before those of the other.
 _LARGEST_HOLE_S: Final = 1.1
 """Longest time in s between two velocities for interpolation; receivers send one a second."""
 _HALF_WINDOW_S: Final = 1.0
-"""Time in s before and behind a fix over which its speed is a slope of positions."""
+"""Time in s before and after a fix over which its speed is a slope of positions."""
 _MAX_WAITING: Final = 1000
 _BACK: Final = 20
 """Number of past stamps after which the clock has been set back."""

@@ -16,7 +16,7 @@ from services.common.options import (
     site_option,
 )
 
-_TABLES: Final = "tables of other loggers"
+_TABLES: Final = "CSV tables of other loggers"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +53,11 @@ class ImportOptions:
         "file to write the guessed map to, for --map", "MAP.toml", IMPORT_MAP, group=_TABLES
     )
     map: Path | None = file_option(
-        "map of files, columns, units and times to read by", "MAP.toml", group=_TABLES
+        "column map (files, columns, units, times) to read the tables with",
+        "MAP.toml",
+        group=_TABLES,
     )
-    yes: bool = flag("accept guesses that change numbers", group=_TABLES)
+    yes: bool = flag("accept guesses that change values (units, signs, gravity)", group=_TABLES)
     zone: str | None = opt(
         "time zone of times without one: UTC, +01:00, Europe/Berlin", group=_TABLES
     )

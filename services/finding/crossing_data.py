@@ -15,8 +15,8 @@ Floats = NDArray[np.float64]
 
 _MARGIN_S = 1.0
 """Time in s before the entry and after the exit for which samples are required."""
-APPROACH_M, BEHIND_M = 40.0, 25.0
-"""Length of road in m before and behind the bridge; 50 m determine the mismatch power to ±15 %."""
+APPROACH_M, AFTER_M = 40.0, 25.0
+"""Length of road in m before and after the bridge; 50 m determine the mismatch power to ±15 %."""
 LONGEST_MARGIN_S = 4.0
 
 
@@ -77,10 +77,10 @@ def close_window(stay: Stay, bridge: Bridge, vehicle: Vehicle) -> Window:
 
 
 def wide_window(stay: Stay, bridge: Bridge, vehicle: Vehicle) -> Window:
-    """Return the stay with the road before and behind the bridge, at most `LONGEST_MARGIN_S`."""
+    """Return the stay with the road before and after the bridge, at most `LONGEST_MARGIN_S`."""
     seconds_per_m = (stay.exit_s - stay.entry_s) / (bridge.span_m + vehicle.length_m)
     before, behind = (
         min(max(metres * seconds_per_m, _MARGIN_S), LONGEST_MARGIN_S)
-        for metres in (APPROACH_M, BEHIND_M)
+        for metres in (APPROACH_M, AFTER_M)
     )
     return Window(stay.entry_s - before, stay.exit_s + behind)

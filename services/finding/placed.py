@@ -40,7 +40,7 @@ _AS_WELL = 2.0
 _BARELY = 0.05
 """Share by which another sensor's error may explain less and is still named."""
 _SWAPPED = 0.1
-"""Largest share of the residual that an exchange may leave."""
+"""Largest share of the residual that a swap may leave."""
 _LOOSE = 0.1
 """Share of motion unexplained by gain and delay that no twisting frame causes."""
 _TURNED = 1.5
@@ -252,15 +252,15 @@ def disagreement(
         if found.power <= found.expected:
             continue
         own = np.flatnonzero(np.abs(parity).sum(axis=0))
-        exchanged = []
+        swapped = []
         for i, k in combinations(own.tolist(), 2):
             other = acceleration.copy()
             other[[i, k]] = acceleration[[k, i]]
             again = judged(parity, other)
             if again.power <= min(again.expected, _SWAPPED * found.power):
-                exchanged.append(f"{names[i]} and {names[k]}")
-        if exchanged:
-            return {Reason.CHANNEL_SWAPPED: ", or ".join(exchanged)}
+                swapped.append(f"{names[i]} and {names[k]}")
+        if swapped:
+            return {Reason.CHANNEL_SWAPPED: ", or ".join(swapped)}
         best = np.nanmin(found.unexplained)
         if best < _EXPLAINED:
             guilty = [k for k in own if found.unexplained[k] <= _AS_WELL * best + _BARELY]

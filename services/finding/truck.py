@@ -174,7 +174,7 @@ class TruckBoot:
         """Return whether a crossing lacks data older than some that were received."""
         latest_s = self.boot.latest_accel_s()
         if latest_s < stay.exit_s:
-            return True  # positions from behind the bridge were received
+            return True  # positions from after the bridge were received
         end_s = min(window.end_s, latest_s - _ROUNDING_S)
         return self.boot.lacks_accel(window.begin_s - MAX_BATCH_S, end_s)
 

@@ -131,13 +131,13 @@ def _comparison_sentence(found: PeriodComparison, unit: Unit) -> str:
     first, last = period_name(found.first_s, unit), period_name(found.last_s, unit)
     size = sorted(found.changes, key=_deviations, reverse=True)
     clear = [one for one in size if one.is_clear]
-    rest = "Temperature and season are not taken out."
+    rest = "These values are not corrected for temperature or season."
     if not clear:
         most = size[0]
         return (
-            f"From {first} to {last} no element changed by more than its 95 % interval; most is "
-            f"element {most.element}, {_percent(most.ratio)} ({_percent(most.low)} to "
-            f"{_percent(most.high)}). {rest}"
+            f"From {first} to {last} no element changed by more than its 95 % interval; the "
+            f"largest change is that of element {most.element}, {_percent(most.ratio)} "
+            f"({_percent(most.low)} to {_percent(most.high)}). {rest}"
         )
     changed = ", ".join(
         f"element {one.element} {_percent(one.ratio)} (95 % interval {_percent(one.low)} to "

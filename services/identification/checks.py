@@ -53,7 +53,7 @@ _LARGEST_SPEED_SCALE_Z = 5.0
 """Largest tolerated difference between the receiver's speeds and the derivative of its positions,
 in standard deviations. Sound: at most 2."""
 _RECEIVER_ASIDE_S = 4.0
-"""Time before and behind the bridge over which fixes are compared; the fit uses the same."""
+"""Time before and after the bridge over which fixes are compared; the fit uses the same."""
 _SPEED_SCALE_SPREAD = 0.002
 """Standard deviation of the speed scale for a road that is not quite parallel to the bridge's
 axis."""
@@ -268,7 +268,7 @@ def _slack(fit: Fit, kind: int, stretch: int, band: int) -> float:
 
 
 def _stretches(data: CrossingData, fit: Fit) -> NDArray[np.int64]:
-    """Return for each row (m,) whether it lies before, on or behind the bridge."""
+    """Return for each row (m,) whether it lies before, on or after the bridge."""
     span = data.bridge.span_m
     travelled = fit.place_m if data.stay.direction > 0 else span - fit.place_m
     return np.where(travelled < 0.0, BEFORE, np.where(travelled > span, AFTER, ON)).astype(np.int64)

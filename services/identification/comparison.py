@@ -65,7 +65,7 @@ class Comparison(NamedTuple):
     """Comparison of a bridge's elements with one reference."""
 
     reference: Literal["baseline", "others"]
-    level: float
+    median_ratio: float
     """Median of EI over its nominal value, meaningful only with a meaningful nominal value."""
     elements: tuple[Element, ...]
 
@@ -173,17 +173,17 @@ def ambiguous_neighbours(found: Comparison | None, unresolved: Set[int]) -> tupl
 
 
 def origin_of_state(state: BridgeResult) -> str:
-    """Return in a sentence which crossings the numbers of a state are of.
+    """Return in a sentence from which crossings the values of a state are.
 
     The intervals of a single crossing are narrower than those of the state: they do not have the
     variability between crossings.
     """
     used = len(state.crossings_used)
     if used > 1:
-        return f"Numbers of {used} crossings fused."
+        return f"Values from {used} fused crossings."
     if state.between_crossing_std is not None:
-        return "Numbers of one crossing, with between-crossing variability."
-    return "Numbers of one crossing."
+        return "Values from one crossing; the intervals include the between-crossing variability."
+    return "Values from one crossing."
 
 
 def describe_comparison(

@@ -93,7 +93,7 @@ def _place_of_misfit(off_bridge_chi2: float) -> str:
             "wrong span, or a bridge that is no beam"
         )
     return (
-        f"also before and behind the bridge (χ² {off_bridge_chi2:.2g}); likely causes are another "
+        f"also before and after the bridge (χ² {off_bridge_chi2:.2g}); likely causes are another "
         "truck than declared, a faulty sensor, or different profiles under the axles"
     )
 

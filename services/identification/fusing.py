@@ -143,16 +143,16 @@ def fused(
     compared = find_misattributed(parts, priors)
     parts = [part for part in parts if part.name not in compared.misattributed]
     report("putting crossings together", _COMPARED)
-    joint = build_joint(parts, priors)
-    judged = select_consistent(parts, joint, priors)
+    information = build_joint(parts, priors)
+    judged = select_consistent(parts, information, priors)
     if judged.left_out:
         parts = [part for part in parts if part.name in judged.agree]
-        joint = build_joint(parts, priors)
+        information = build_joint(parts, priors)
 
     def drawing(stage: str, fraction: float) -> None:
         report(stage, _JOINED + (1.0 - _JOINED) * fraction)
 
-    found = sample_joint(joint, priors, _DRAWS_PER_CHAIN, _SEED, drawing, threads)
+    found = sample_joint(information, priors, _DRAWS_PER_CHAIN, _SEED, drawing, threads)
     nominal = priors.coordinates.location[-priors.elements :]
     spread = priors.coordinates.scale[-priors.elements :]
     y = found.draws.reshape(-1, found.draws.shape[2])[:, -priors.elements :]

@@ -288,7 +288,7 @@ def _values(
     settings: IdentificationSettings,
     keep: Keep,
 ) -> dict[str, Any]:
-    """Scale error, parameters, covariance, derived quantities and road from the draws."""
+    """Return common scale uncertainty, parameters, covariance, derived quantities and road."""
     flat = chain.draws.reshape(-1, chain.draws.shape[2])
     at = posterior.values_of(problem, flat)
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(10**9,)))

@@ -37,20 +37,20 @@ MAX_UNEXPLAINED = 0.3
 _BETTER = 0.5
 """Share of the body's motion that the body equations leave unexplained.
 
-Fault-free: at most 0.10; two channels exchanged or one inverted: at least 0.36, and then at most
+Fault-free: at most 0.10; two channels swapped or one inverted: at least 0.36, and then at most
 0.10 after correction.
 """
 _LEAD = 0.6
 """Correlation of the axles' motions at one chainage.
 
-Fault-free: 0.71 to 0.99 (with the axles exchanged: -0.72 to 0.49).
+Fault-free: 0.71 to 0.99 (with the axles swapped: -0.72 to 0.49).
 """
 
 
 _FOLLOWS = 0.25
 """Correlation of a tandem's axles, and of the body in front and behind, at one place. Sound: 0.34
-to 0.77; axles exchanged -0.30 to 0.15, the front reading inverted -0.68 to -0.34. What the bogie's
-equation leaves over: sound 0.04 to 0.16, another reading inverted or exchanged 0.37 to 0.98."""
+to 0.77; axles swapped -0.30 to 0.15, the front reading inverted -0.68 to -0.34. What the bogie's
+equation leaves over: sound 0.04 to 0.16, another reading inverted or swapped 0.37 to 0.98."""
 
 
 def reasons_before_fit(
@@ -82,7 +82,7 @@ def reasons_before_fit(
     if not reasons:
         return {}
     found = quality.assign_channels(readings, step_s, *body_constants(vehicle))
-    named = {Reason.CHANNEL_INVERTED: _inverted, Reason.CHANNEL_SWAPPED: _exchanged}
+    named = {Reason.CHANNEL_INVERTED: _inverted, Reason.CHANNEL_SWAPPED: _swapped}
     names = placed.middle_names(vehicle)
     return {reason: named[reason](found, names) for reason in reasons}
 
@@ -111,7 +111,7 @@ def unmeasured(channels: tuple[str, ...], acceleration: Floats, step_s: float) -
 def of_one_sensor(
     vehicle: Vehicle, acceleration: Floats, readings: Floats, step_s: float
 ) -> dict[Reason, str]:
-    """Return the reason and the sensors whose inversion or exchange explains an inconsistent body.
+    """Return the reason and the sensors whose inversion or swap explains an inconsistent body.
 
     Where several sensors form a middle reading, one inverted among them makes it a roll.
     """
@@ -180,10 +180,10 @@ def _inverted(found: quality.ChannelAssignment, names: tuple[str, ...]) -> str:
     return " and ".join(f"{names[end]} or {names[2 + end]}" for end in ends)
 
 
-def _exchanged(found: quality.ChannelAssignment, names: tuple[str, ...]) -> str:
-    """Return the names of exchanged channels; with "or" where the equations are ambiguous.
+def _swapped(found: quality.ChannelAssignment, names: tuple[str, ...]) -> str:
+    """Return the names of swapped channels; with "or" where the equations are ambiguous.
 
-    Front and rear are alike to them: with both pairs exchanged as well they hold as before. So of
+    Front and rear are alike to them: with both pairs swapped as well they hold as before. So of
     both corrections the one that moves fewer channels is named.
     """
     if found.recorded <= MAX_UNEXPLAINED:
@@ -234,10 +234,10 @@ def of_tandem(
     travelled = direction * (motion.position_m - motion.position_m[0])
     if np.any(np.diff(travelled) <= 0.0):
         return {}
-    right, exchanged = quality.axle_correlation(
+    right, swapped = quality.axle_correlation(
         readings[2], readings[3], step_s, travelled, tandem.gap_m
     )
-    if exchanged > _FOLLOWS and right < 0.5 * exchanged:
+    if swapped > _FOLLOWS and right < 0.5 * swapped:
         return {Reason.CHANNEL_SWAPPED: f"{names[2]} and {names[3]}"}
     follows = quality.axle_correlation(
         readings[0], readings[1], step_s, travelled, vehicle.wheelbase_m
@@ -265,7 +265,7 @@ def body_constants(vehicle: Vehicle) -> tuple[Floats, Floats]:
 def order_and_signs(
     vehicle: Vehicle, acceleration: Floats, step_s: float, motion: Motion, direction: int
 ) -> list[Reason]:
-    """Return the reason if channels (4, n) are exchanged or inverted; else an empty list."""
+    """Return the reason if channels (4, n) are swapped or inverted; else an empty list."""
     found = quality.assign_channels(acceleration, step_s, *body_constants(vehicle))
     if found.recorded > MAX_UNEXPLAINED:
         turned = [
@@ -281,11 +281,11 @@ def order_and_signs(
     travelled = direction * (motion.position_m - motion.position_m[0])
     if np.any(np.diff(travelled) <= 0.0):
         return []
-    right, exchanged = quality.axle_correlation(
+    right, swapped = quality.axle_correlation(
         acceleration[2], acceleration[3], step_s, travelled, vehicle.wheelbase_m
     )
     if right < -_LEAD:
         return [Reason.CHANNEL_INVERTED]
-    if exchanged > _LEAD > 2.0 * right:
+    if swapped > _LEAD > 2.0 * right:
         return [Reason.CHANNEL_SWAPPED]
     return []

@@ -182,7 +182,10 @@ def check_assignment(
     names = placed.middle_names(vehicle)
     if Reason.CHANNEL_SWAPPED in reasons:
         return CheckFinding(
-            "channel_swapped", CheckStatus.WRONG, _swapped(found, names), "exchange or rename them"
+            "channel_swapped",
+            CheckStatus.WRONG,
+            _swapped(found, names),
+            "swap the two plugs, or correct the names",
         )
     if Reason.CHANNEL_INVERTED in reasons:
         return CheckFinding(
@@ -205,7 +208,12 @@ def tandem_in_place(
     """Check order and signs of the middle readings (4, n) of a truck with a tandem."""
     for reason, names in signal_checks.of_tandem(vehicle, acceleration, step_s, motion, 1).items():
         text = f"{REASON_TEXTS[reason].removesuffix('.')}: {names}"
-        return CheckFinding(str(reason), CheckStatus.WRONG, text, "exchange or turn them")
+        return CheckFinding(
+            str(reason),
+            CheckStatus.WRONG,
+            text,
+            "swap the plugs, turn the sensor, or correct the names",
+        )
     text = "the tandem's axles explain the body's motion"
     return CheckFinding("channels_in_place", CheckStatus.OK, text)
 
@@ -239,7 +247,7 @@ def scan_wheelbase(
 
 def _swapped(found: quality.ChannelAssignment, names: tuple[str, ...]) -> str:
     if found.recorded <= signal_checks.MAX_UNEXPLAINED:
-        return "the rear axle moves first: front and rear are exchanged"
+        return "the rear axle moves first: front and rear are swapped"
     pairs = [
         f"{names[k]} looks like {names[found.best_order.index(k)]}"
         for k in range(4)

@@ -1,4 +1,4 @@
-"""Check of the bridges' coordinates against the driven track."""
+"""Check of the bridges' coordinates against the driven path."""
 
 from collections.abc import Iterator
 from typing import Final, NamedTuple
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from schemas.site import Bridge, Receiver, Vehicle
 from services.common.geodesy import bridge_frame, to_chainage
-from services.finding.crossing_data import APPROACH_M, BEHIND_M, LONGEST_MARGIN_S
+from services.finding.crossing_data import AFTER_M, APPROACH_M, LONGEST_MARGIN_S
 from services.finding.stays import CORRIDOR_M, Passage, Stay, stays_on
 from services.identification.identify import SLOWEST_M_PER_S
 from services.inspection.finding import CheckFinding, CheckStatus, check_finding
@@ -34,10 +34,10 @@ class CrossingTrack(NamedTuple):
     lateral_m: float
     """Median lateral position on the bridge, m."""
     angle_deg: float
-    """Angle between the track and the bridge's line."""
+    """Angle between the path and the bridge's line."""
     before_m: float
     """Length of recorded road before the entry, m."""
-    behind_m: float
+    after_m: float
 
 
 def bridge_findings(
@@ -64,7 +64,7 @@ def _not_crossed(
             "bridge_crossed",
             CheckStatus.WRONG,
             f"{bridge.id}: the recording {stays[0].passage.value}",
-            "record from before the bridge to behind it, without stopping",
+            "record from before the bridge until after it, without stopping",
         )
     beside = np.flatnonzero((chainage > 0.0) & (chainage < bridge.span_m))
     outside = np.maximum(np.maximum(-chainage, chainage - bridge.span_m), 0.0)
@@ -74,8 +74,8 @@ def _not_crossed(
         return CheckFinding(
             "bridge_place",
             CheckStatus.WRONG,
-            f"{bridge.id}: the track passes {abs(lateral[beside]).min():.0f} m beside its line, "
-            f"{CORRIDOR_M:g} m are taken for a passage",
+            f"{bridge.id}: the path passes {abs(lateral[beside]).min():.0f} m from the line "
+            f"between the bearings; up to {CORRIDOR_M:g} m counts as on the bridge",
             "correct the coordinates of the bearings, latitude and longitude of both ends",
         )
     if nearest < _NEAR_M:
@@ -83,7 +83,7 @@ def _not_crossed(
         return CheckFinding(
             "bridge_place",
             CheckStatus.WRONG,
-            f"{bridge.id}: the track ends {nearest:.0f} m from its {side} and does not reach over "
+            f"{bridge.id}: the path ends {nearest:.0f} m from its {side} and does not reach over "
             "it",
             "record the whole passage, or correct the coordinates of the bearings",
         )
@@ -92,7 +92,7 @@ def _not_crossed(
         CheckStatus.OPEN,
         f"{bridge.id}: not driven over here"
         + (f", nearest fix {nearest / 1e3:.1f} km away" if np.isfinite(nearest) else ""),
-        "check again with a drive over it",
+        "check again with a crossing of it",
     )
 
 
@@ -149,7 +149,7 @@ def _findings_of_track(
     )
     yield check_finding(
         "bridge_angle",
-        f"{where}: track at {abs(track.angle_deg):.1f}° to its line",
+        f"{where}: path at {abs(track.angle_deg):.1f}° to its line",
         "correct the coordinates of the bearings: the line must be the one that is driven",
         is_wrong=abs(track.angle_deg) > _LARGEST_ANGLE_DEG,
     )
@@ -161,13 +161,13 @@ def _findings_of_track(
     )
     # The identification uses no more road than this (`crossing_data.window`).
     reach_m = LONGEST_MARGIN_S * track.speed_m_per_s
-    for side, have_m, want_m in (
-        ("before", track.before_m, min(APPROACH_M, reach_m)),
-        ("behind", track.behind_m, min(BEHIND_M, reach_m)),
+    for name, side, have_m, want_m in (
+        ("approach_before", "before", track.before_m, min(APPROACH_M, reach_m)),
+        ("approach_behind", "after", track.after_m, min(AFTER_M, reach_m)),
     ):
         yield check_finding(
-            f"approach_{side}",
+            name,
             f"{where}: {have_m:.0f} m recorded {side} it, {want_m:.0f} m are used",
-            f"record more road {side} the bridge: the roads' mismatch is measured there",
+            f"record more road {side} the bridge: the profile mismatch is measured there",
             is_wrong=have_m < _SHORT * want_m,
         )

@@ -117,12 +117,12 @@ _USUAL_SPREAD: Final = 0.3
 
 
 def template_of(truck: Vehicle) -> str:
-    """Return the template with springs, dampers, axles and tyres of a usual truck."""
+    """Return the template with springs, dampers, axles and tyres of a typical truck."""
     lines = []
     for line in TEMPLATE.split("\n"):
         key, _, _ = line.removeprefix("# ").partition(" = ")
         if key in _USUAL:
-            line = f"{f'{key} = {list(getattr(truck, key))}':<60}# usual, not measured"
+            line = f"{f'{key} = {list(getattr(truck, key))}':<60}# typical, not measured"
         elif key.removesuffix("_spread") in _USUAL:
             line = f"{key} = {_USUAL_SPREAD}"
         lines.append(line)

@@ -64,12 +64,12 @@ def _of_the_plan(found: SurveyForecast) -> str:
     if planned.needed_middle is None:
         smallest = planned.expected.smallest_loss[planned.middle]
         return (
-            f"Not even {MAX_CROSSINGS} crossings {how} show {what}: {question.crossings} show one "
-            f"of {percent(smallest)} or more, and give the overall stiffness to "
+            f"Even {MAX_CROSSINGS} crossings {how} do not detect {what}; {question.crossings} "
+            f"detect a loss of {percent(smallest)} or more, and give the overall stiffness to "
             f"± {percent(planned.expected.level_std)}."
         )
     count = _crossings(planned.needed_middle)
-    verb = "shows" if planned.needed_middle == 1 else "show"
+    verb = "detects" if planned.needed_middle == 1 else "detect"
     return f"{count} {how} {verb} {what}; {_ends(planned)}."
 
 
@@ -99,16 +99,17 @@ def _of_the_others(found: SurveyForecast) -> str:
     best = better[0]
     if best.needed_middle is None:
         smallest = best.expected.smallest_loss[best.middle]
-        gain = f"then {found.question.crossings} show {percent(smallest)}"
+        gain = f"then {found.question.crossings} detect a loss of {percent(smallest)}"
     else:
-        verb = "does" if best.needed_middle == 1 else "do"
-        gain = f"then {_crossings(best.needed_middle)} {verb}, and {_ends(best)}"
+        verb = "detects" if best.needed_middle == 1 else "detect"
+        gain = f"then {_crossings(best.needed_middle)} {verb} it, and {_ends(best)}"
     sentence = f"What helps most: {best.plan.name}; {gain}."
     if len(better) > 1:
         next_best = better[1]
         smallest = next_best.expected.smallest_loss[next_best.middle]
         sentence += (
-            f" Next: {next_best.plan.name} ({found.question.crossings} show {percent(smallest)})."
+            f" Next best: {next_best.plan.name} ({found.question.crossings} crossings then detect "
+            f"a loss of {percent(smallest)})."
         )
     return sentence
 

@@ -90,7 +90,7 @@ class CrossingSimulator:
             except ValueError:
                 continue
         raise FailureError(
-            f"at {crossings[0].speed_m_per_s:g} m/s the noise of the rows cannot be computed, "
+            f"at {crossings[0].speed_m_per_s:g} m/s the noise of the residuals cannot be computed, "
             "drive faster or try another --noise"
         )
 
@@ -139,8 +139,8 @@ def _truth(crossing: PlannedCrossing, road: PlannedRoad) -> PosteriorAtTruth:
     found = crossing_data_only([_run(crossing, road)], site, _SETTINGS)
     if len(found) != 1:
         raise InputError(
-            f"{site.bridges[0].id}: a crossing at {speed:g} m/s is not found in the positions of "
-            "[receiver], its values must be those of a receiver that sees the bridge"
+            f"{site.bridges[0].id}: with the accuracy that [receiver] declares, a crossing at "
+            f"{speed:g} m/s cannot be detected from positions; correct its values"
         )
     problem, y = build_problem(inputs_of_seen(found[0]))
     # The common part of all sensors' gains is constant between runs: `scale_error` has it.

@@ -1,4 +1,4 @@
-"""The figure of a plan: probability of detecting a loss over crossings, by element."""
+"""The figure of a plan: probability of detecting a loss against crossings, by element."""
 
 from pathlib import Path
 from typing import Any

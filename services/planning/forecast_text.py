@@ -81,20 +81,21 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     yield ""
     yield from _aligned(_elements(found))
     yield (
-        f"mean of all elements: ± {_percent(planned.once.level_std)} by 1 crossing, "
-        f"± {_percent(planned.expected.level_std)} by {question.crossings}"
+        f"overall stiffness: ± {_percent(planned.once.level_std)} after 1 crossing, "
+        f"± {_percent(planned.expected.level_std)} after {question.crossings}"
     )
     yield "±: standard deviation of EI, near 55 % the prior's; seen: probability that the"
     yield "loss is detected against the nominal value; vs others: against the others;"
     yield f"smallest: loss that is detected with {percent(DETECTION_PROBABILITY)} probability"
     yield ""
     yield from _aligned(_comparison(found))
-    yield f"by {question.crossings} crossings; mean ±: of what all elements share; mid ±, seen,"
     wanted = percent(DETECTION_PROBABILITY)
-    yield f"smallest: at midspan; needed, ends: crossings until it is seen with {wanted}"
-    yield f"at midspan, at both ends (elsewhere between them); –: more than {MAX_CROSSINGS};"
-    yield "t: if legal axle and total loads allow it; the other way: in the other lane;"
-    yield "elements: longer ones"
+    yield f"after {question.crossings} crossings; overall, mid: standard deviations of the overall"
+    yield "stiffness and of EI at midspan; seen, smallest: at midspan; needed, ends:"
+    yield f"crossings until the loss is detected with {wanted} at midspan, at both ends"
+    yield f"(elsewhere between them); –: more than {MAX_CROSSINGS};"
+    yield "at … t: only if legal axle and total loads allow it;"
+    yield "the other way: in the opposite lane; … elements: fewer, longer ones"
     yield ""
     for line in warnings(found):
         yield f"warning: {line}"
@@ -117,8 +118,8 @@ def _elements(found: SurveyForecast) -> list[list[str]]:
         "element",
         "from m",
         "to m",
-        "± by 1",
-        f"± by {count}",
+        "± after 1",
+        f"± after {count}",
         "seen",
         "vs others",
         "smallest",
@@ -142,7 +143,7 @@ def _elements(found: SurveyForecast) -> list[list[str]]:
 
 
 def _comparison(found: SurveyForecast) -> list[list[str]]:
-    rows = [["what if", "mean ±", "mid ±", "seen", "smallest", "needed", "ends"]]
+    rows = [["what if", "overall", "mid", "seen", "smallest", "needed", "ends"]]
     rows += [_cells(one, one.plan.name) for one in (found.planned, *found.others)]
     rows += [
         [

@@ -33,7 +33,7 @@ def plan_survey(
 ) -> SurveyForecast:
     """Return the forecast; `report` receives the finished and all jobs.
 
-    Raise InputError for a tandem whose axles do not share their load.
+    Raise InputError for a tandem without load equalisation.
     """
     site = middle_site(given)
     vehicle = site.vehicles[0]

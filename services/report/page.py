@@ -246,7 +246,7 @@ def _caveats(report: BridgeReport, language: Language) -> Iterator[Html]:
         return
     notes = [language.text("note.change")]
     if comparison.reference == "others":
-        notes = [language.text("note.no_baseline", level=comparison.level)]
+        notes = [language.text("note.no_baseline", median=comparison.median_ratio)]
     if report.finding.kind != "open":  # there the finding itself states it
         notes.append(_visible(comparison, language))
     yield tag("p", " ".join(notes), class_="note")

@@ -64,13 +64,13 @@ def drawn_tandem(
 
     `truth` is of `draw_truth`: its bridge, channels and conditions are used. The truck is drawn
     with `truck_seed`, noise, receiver and lateral position with `seed`. Raise InputError for a
-    tandem whose axles do not share their load.
+    tandem without load equalisation.
     """
     vehicle, how = site.vehicles[0], truth.conditions
     if vehicle.tandem is None or not vehicle.tandem.is_equalised:
         raise InputError(
-            f"{vehicle.id}: its axles 2 and 3 have springs of their own, a tandem whose axles "
-            "share their load is simulated"
+            f"{vehicle.id}: its axles 2 and 3 have springs of their own, only an equalised "
+            "tandem is simulated"
         )
     rng = np.random.default_rng(np.random.SeedSequence([seed, 0x7A2F]))
     beam, bridge = truth.beam, site.bridges[0]

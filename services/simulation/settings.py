@@ -48,7 +48,7 @@ class SimulateOptions:
         metavar="N",
     )
     ei: tuple[float, ...] | None = opt(
-        "flexural rigidity of each element over its undamaged value",
+        "flexural rigidity of each element as a share of its undamaged value",
         _ratios,
         alternatives=_TRUTH,
         required=True,
@@ -125,13 +125,14 @@ class SimulateOptions:
         metavar="M",
     )
     wander: float | None = opt(
-        "lateral standard deviation between runs in m, on a 2-D surface (default: 0)",
+        "lateral wander: standard deviation of the lateral position between runs in m, on a 2-D "
+        "surface (default: 0)",
         number("a standard deviation in m", low=0, high=2),
         group=_SURFACE,
         metavar="M",
     )
     deck_roughness: float | None = opt(
-        "roughness on the bridge over that off it, on a 2-D surface (default: 1)",
+        "roughness on the bridge relative to that off it, on a 2-D surface (default: 1)",
         number("a factor", low=0.1, high=10),
         group=_SURFACE,
         metavar="FACTOR",
@@ -144,8 +145,8 @@ class SimulateOptions:
         metavar="MM",
     )
     anisotropy: float | None = opt(
-        "lateral correlation length over that of an isotropic surface, on a 2-D surface "
-        "(default: 1)",
+        "lateral correlation length relative to that of an isotropic surface, on a 2-D "
+        "surface (default: 1)",
         number("a factor", low=0.2, high=20),
         group=_SURFACE,
         metavar="FACTOR",
@@ -175,7 +176,7 @@ class SimulateOptions:
         metavar="N:M_PER_S:S",
     )
     friction: float = opt(
-        "suspension friction over the static load",
+        "suspension friction as a share of the static load",
         number("a share of the springs' load", low=0, high=0.5),
         group=_BEYOND,
         default=0.0,
@@ -196,22 +197,23 @@ class SimulateOptions:
         metavar="SHARE",
     )
     air_springs: float = opt(
-        "polytropic exponent of air springs; 1.38 is usual",
+        "polytropic exponent of air springs; 1.38 is typical",
         number("a polytropic exponent", low=1, high=2),
         group=_BEYOND,
         default=0.0,
         metavar="EXPONENT",
     )
     lane_offset: float | None = opt(
-        "distance of the lane's middle to the left of the bridge's axis, looking from start "
-        "to end; with --torsion the deck twists under it (default: the site's, or 0)",
+        "distance of the lane's centre line from the bridge's axis in m, positive to the left "
+        "looking from start to end; with --torsion the deck twists under it (default: the "
+        "site's, or 0)",
         number("a distance in m", low=-20, high=20),
         group=_BEYOND,
         metavar="M",
     )
     torsion: tuple[float, float] | None = opt(
-        "first torsional over first bending frequency of the deck and its radius of "
-        "gyration, with a lane offset (2:2.3 is usual; default: the site's, or no twist)",
+        "ratio of the deck's first torsional to its first bending frequency, and its radius of "
+        "gyration in m, with a lane offset (2:2.3 is typical; default: the site's, or no twist)",
         numbers("a frequency ratio and a radius of gyration in m (RATIO:M)", (0.2, 100), (0.1, 30)),
         group=_BEYOND,
         metavar="RATIO:M",

@@ -22,7 +22,7 @@ Complexes = NDArray[np.complex128]
 
 _CLASSES: Final = "ABCDE"
 _CLASS_A_M3: Final = 16e-6
-"""Geometric mean of G_d at the reference wave number; four times as much in each further class."""
+"""Geometric mean of G_d at the reference frequency; four times as much in each next class."""
 _REFERENCE_CYCLES_PER_M: Final = 0.1
 _LONGEST_WAVE_M: Final = 100.0
 _SHORTEST_WAVE_M: Final = 0.1
@@ -32,7 +32,7 @@ _ALONG_STEP_CYCLES_PER_M: Final = 0.004
 _ACROSS: Final = 160
 _WIDEST_CYCLES_PER_M: Final = 40.0
 _ACROSS_SCALE_CYCLES_PER_M: Final = 0.02
-"""Lateral wave number below which cells are even, and above which they grow in proportion."""
+"""Lateral spatial frequency below which cells are even, and above which they grow in proportion."""
 
 
 class Waves(NamedTuple):

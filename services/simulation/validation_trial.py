@@ -63,7 +63,7 @@ LEAST_COVERAGE: Final = 0.85
 studies/site-validation.md."""
 LARGEST_RMS_Z: Final = 1.5
 LARGEST_Z_GOOD: Final = 5.0
-"""Largest normal score of a `good` crossing, as in docs/validation.md."""
+"""Largest standardised error of a `good` crossing, as in docs/validation.md."""
 SURE_COVERAGE: Final = 0.93
 SURE_RMS_Z: Final = 1.2
 """Largest RMS score at which `FEWEST` crossings, all good, suffice."""

@@ -58,7 +58,7 @@ SUBSCRIBER_TIMEOUT_S = 1.0
 
 
 def run(asked: TruckSettings, *, connect_timeout_s: float | None = CONNECT_TIMEOUT_S) -> int:
-    """Play one vehicle of a recording as a truck that drives now; return 0.
+    """Play one vehicle of a recording as if it were driving now; return 0.
 
     A folder of CSV files may replace the recording (docs/contract.md). The playback is a new boot
     of that truck: new boot_id, sequences from 0, and times shifted as a whole so that the recording

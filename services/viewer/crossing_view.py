@@ -107,7 +107,7 @@ class ResidualCells(NamedTuple):
     mean_square: FloatArray
     """Mean squares (3, 3, b): kinds, segments and bands; NaN without data.
 
-    The kinds are profiles, front and rear body; the segments before, on and behind the bridge.
+    The kinds are profiles, front and rear body; the segments before, on and after the bridge.
     """
     excess_std: FloatArray
     """Excess (3, 3, b) over 1, in standard deviations of chance."""
@@ -208,7 +208,7 @@ def summary_line(view: CrossingView) -> str:
         f"method {view.method.replace('_', ' ')}",
     ]
     if view.chi2_per_dof is not None:
-        parts.append(f"χ² per degree of freedom {view.chi2_per_dof:.2f}")
+        parts.append(f"reduced chi-square {view.chi2_per_dof:.2f}")
     return " · ".join(parts)
 
 

@@ -39,7 +39,7 @@ _LINE_CHARACTERS = 105
 _MAX_PER_CENT = 400.0
 """Upper end of the axes; an interval beyond it means that the element is unresolved."""
 _LEAST_DAYS = {"day": 3.0, "week": 7.0, "month": 31.0}
-"""Minimum time shown before the first and behind the last middle of a period: all of it, at least.
+"""Minimum time shown before the first and after the last middle of a period: all of it, at least.
 
 A point in the middle of an axis of two weeks would seem to be of that day, not of that month.
 """
@@ -176,7 +176,7 @@ def _heading(history: HistoryView) -> list[tuple[str, str]]:
             lines.append((f"“{_short(mark.note)}”", MUTED))
     if any(not mark.acknowledged for mark in history.marks):
         how = f"driveby alarm ack {history.bridge} --by NAME --note TEXT"
-        lines.append((f"Look at the bridge, then: {how}", MUTED))
+        lines.append((f"Inspect the bridge, then acknowledge the alarm: {how}", MUTED))
     for one in history.statements:
         colour = VERDICT_COLOURS["good"] if one.is_reassuring else INK
         lines += [(line, colour) for line in textwrap.wrap(one.text, _LINE_CHARACTERS)]
@@ -231,7 +231,7 @@ def _draw_element(axes: Axes, history: HistoryView, n: int, limits: tuple[float,
             since, raised = _dates([mark.since_s, mark.raised_s])
             axes.axvspan(since, raised, color=colour, alpha=0.13, linewidth=0.0)
             axes.axvline(raised, color=colour, linewidth=1.6)
-            wording = "stiffer" if mark.is_stiffer else "weaker"
+            wording = "stiffer" if mark.is_stiffer else "less stiff"
             axes.annotate(
                 f"{wording}, noted" if mark.acknowledged else wording, (raised, limits[1]),
                 xytext=(4, -3), textcoords="offset points", va="top", fontsize=8.5,

@@ -99,7 +99,7 @@ def _bridge(bridge: str) -> rrb.Container:
     infinite = rrb.TimeRangeBoundary.infinite()
     trend = rrb.TimeSeriesView(
         origin=trend_root(bridge),
-        name="Fused EI / nominal over time; orange: lowest element",
+        name="Fused EI / nominal over time; white: lowest element, not necessarily weak",
         axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=infinite, end=infinite)),
         axis_y=rrb.ScalarAxis(range=(0.0, 1.6)),
         time_ranges=[rrb.VisibleTimeRange(TIME, start=infinite, end=infinite)],

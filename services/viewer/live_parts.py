@@ -17,7 +17,6 @@ from services.viewer.crossing_view import VEHICLE_COLOURS, CrossingView, Element
 from services.viewer.rerun_parts import (
     MUTED,
     TIME,
-    WEAK,
     IntArray,
     log_labels,
     log_line,
@@ -33,6 +32,8 @@ ROADS_MIDDLE: Final = STRIP_HEIGHT + 330.0
 ROADS_REACH: Final = 120.0
 _QUALITY: Final = 95
 _MAX_ALARMS: Final = 1000
+_LOWEST: Final = "#FFFFFF"
+"""Colour of the lowest element, which every bridge has: not that of a weak one."""
 _NEAR_M: Final = 2_000.0
 """Distance in m up to which a truck is on a bridge's plan."""
 NO_RESULT: Final = "No result yet. Results appear seconds after a truck leaves the bridge."
@@ -135,9 +136,9 @@ def log_trend_style(recording: rr.RecordingStream, root: str, elements: int) -> 
     """Define the style of a bridge's trend: all elements alike, the lowest with its interval."""
     styles = [(f"EI_{n}", f"EI_{n}", VEHICLE_COLOURS["front"], 2.0) for n in range(1, elements + 1)]
     styles += [
-        ("lowest/mean", "lowest", WEAK, 4.0),
-        ("lowest/low", "2.5 %", WEAK, 1.5),
-        ("lowest/high", "97.5 %", WEAK, 1.5),
+        ("lowest/mean", "lowest", _LOWEST, 4.0),
+        ("lowest/low", "2.5 %", _LOWEST, 1.5),
+        ("lowest/high", "97.5 %", _LOWEST, 1.5),
     ]
     for entity, name, colour, size in styles:
         log_line(recording, f"{root}/{entity}", name, colour, width=size / 2.0)

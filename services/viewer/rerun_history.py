@@ -23,7 +23,7 @@ _TIME = "date"
 _GOOD, _DOUBTFUL, _TEMPERATURE = (86, 180, 233), (150, 150, 150), (204, 121, 167)
 _DOTS_PER_INCH = 110
 _BESIDE_S = 15 * 86_400
-"""Margin in s before the first and behind the last period, so that both are visible."""
+"""Margin in s before the first and after the last period, so that both are visible."""
 
 
 def view_history(past: BridgeHistory, *, web: bool) -> int:

@@ -44,8 +44,8 @@ WEAK, BASELINE = "#E69F00", "#009E73"
 UNKNOWN = "#CC79A7"
 """Colour of a bridge with unknown EI, distinct from those with a meaning."""
 _RATIO_COLOURS = ((0.8, (230, 159, 0)), (1.0, (86, 180, 233)))
-"""Colours of relative EI: from 0.8 down that of a weak element in every picture."""
-RATIO_LEGEND = "orange: EI ≤ 0.8"
+"""Colours of relative EI on plan and map."""
+RATIO_LEGEND = "orange: EI / nominal ≤ 0.8"
 
 
 def channel_colour(channel: str) -> str:

@@ -39,7 +39,7 @@ NEAR_M = 20_000.0
 M_PER_DEGREE = 111_200.0
 """Mean length of a degree of latitude in m, for drawing only."""
 PLAN_MARGIN = 0.3
-"""Margin of the plan before and behind the bridge, as a share of the span."""
+"""Margin of the plan before and after the bridge, as a share of the span."""
 _HALF_WIDTH = 0.02
 """Half width of a bridge in the plan, as a share of the span: its width is unknown."""
 

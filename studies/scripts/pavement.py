@@ -25,7 +25,7 @@ from pre_core.crossing import posterior
 from pre_core.crossing.bound import central_jacobian
 from pre_core.crossing.compliances import to_compliance_coordinates
 from pre_core.crossing.mismatch import BridgePavement
-from pre_core.crossing.noise import no_force_noise
+from pre_core.crossing.noise import no_suspension_noise
 from pre_core.crossing.off_bridge import levels_at
 from pre_core.crossing.pavement import known_pavement
 from pre_core.crossing.preparation import update_noise
@@ -86,7 +86,7 @@ def linearised(at: PosteriorAtTruth, pavement: BridgePavement | None) -> tuple[L
     """
     problem, y = at
     level = levels_at(problem, y)
-    problem = update_noise(problem, y, no_force_noise(), mismatch=level, pavement=pavement)
+    problem = update_noise(problem, y, no_suspension_noise(), mismatch=level, pavement=pavement)
     where = posterior.layout(problem)
     jacobian = central_jacobian(problem, y, np.arange(where.size))
     residual = posterior.all_rows(problem, y[None, :])[0]

@@ -51,7 +51,7 @@ class Bound(NamedTuple):
     """Relative standard deviations (absolute for supports), by parameter name."""
 
     std: dict[str, float]
-    """Standard deviations with the scale error, as in results."""
+    """Standard deviations with the common scale uncertainty, as in results."""
     std_without_scale: dict[str, float]
     chi2_per_dof: float
     """Reduced chi-square at the truth: it judges the model, independently of a search."""

@@ -56,7 +56,7 @@ truck and a real bridge are so is not shown here.
 ![Errors, coverage, ranks and widths]({image})
 
 Errors are judged in ln EI, in which the prior is normal: z = (ln median − ln truth) over the
-standard deviation that the 2.5 and 97.5 % quantiles give. The scale error (total mass, common
+standard deviation that the 2.5 and 97.5 % quantiles give. The common scale uncertainty (total mass,
 gain) is part of both the interval and the truth. The bound is the Cramér-Rao bound of the same
 rows, receiver and priors at the truth; the variance of a support spring is that of a normal cut
 off at zero there. Standard errors are taken between crossings, because elements of one crossing
@@ -109,13 +109,15 @@ _WORLDS = """
 
 Crossings whose truck and bridge are drawn as above, but on free and rigid bearings and undamped
 tyres; then with one effect, or with all but the surface, torsion, left-and-right and pavement,
-which are on roads of their own. The ranges are in `services/simulation/out_of_model.py`; none is a
-prior of the method. Answered is what is not
-rejected; covered is the share of the 95 % intervals of EI that hold the truth, of all that were
-answered and of those that are `good`; z is the error over the standard deviation: its mean over all
-elements and that of the worst element, its root mean square (rms), and its largest size where the
-verdict is `good` (max); std is the median relative standard deviation of EI, for the surface also
-over the Cramér-Rao bound at the truth with the roads' mismatch in its noise (of bound).
+which are on roads of their own. Sprung is a rotational restraint, sinking a bearing compliance,
+swing an initial vibration, tyres their damping, bilinear a damper stronger in rebound, air an air
+spring, spans more than one, surface a 2-D road surface (`services/simulation/out_of_model.py` has
+the ranges; none is a prior of the method). Answered is what is not rejected; covered is the share
+of the 95 % intervals of EI that hold the truth, of all that were answered and of those that are
+`good`; z is the error over the standard deviation: its mean over all elements and that of the worst
+element, its root mean square (rms), and its largest size where the verdict is `good` (max); std is
+the median relative standard deviation of EI, for the surface also over the Cramér-Rao bound at the
+truth with the profile mismatch in its noise (of bound).
 
 | {headings} |
 | --- |{rules}

@@ -4,12 +4,12 @@
 
 Weeks of three crossings by three trucks over a bridge of seven elements (the likelihoods of
 tests/fleet.py), each with 0.5 % of change of its own. Beside that a bridge does not change (white),
-wanders (an Ornstein-Uhlenbeck process of 1.2 % with a memory of 26 weeks, half of its variance
-common to all elements), or follows its temperature (season: -0.3 % a kelvin, 11 K of annual wave,
-4 K of weather). Of bridges whose temperature is known the first eight weeks are training, of the
-others the first year. Sound bridges are watched until week 104, or 156 where the temperature is
-unknown; losses begin half a year into what is judged, roughly, and are followed for a year and a
-half.
+drifts slowly (an Ornstein-Uhlenbeck process of 1.2 % with a correlation time of 26 weeks, half of
+its variance common to all elements), or follows its temperature (season: -0.3 % a kelvin, 11 K of
+annual wave, 4 K of weather). Of bridges whose temperature is known the first eight weeks are
+training, of the others the first year. Sound bridges are watched until week 104, or 156 where the
+temperature is unknown; losses begin half a year into what is judged, roughly, and are followed for
+a year and a half.
 
 Every bridge has its own seed, of `--seed`, the row's number and its own.
 """
@@ -50,14 +50,14 @@ class Kind(NamedTuple):
     """What a bridge does beside changing."""
 
     name: str
-    wander_weeks: float | None = None
-    """Memory of its wander."""
+    correlation_weeks: float | None = None
+    """Correlation time of its drift."""
     has_season: bool = False
 
 
 KINDS = (
     Kind("white"),
-    Kind("wander", 26.0),
+    Kind("drift", 26.0),
     Kind("season", has_season=True),
 )
 
@@ -161,15 +161,15 @@ def _series() -> Iterator[tuple[Kind, bool]]:
 
 def _losses() -> Iterator[tuple[Kind, bool, float, float, bool]]:
     usual = AlarmRules().at_least
-    white, wander, season = KINDS
+    white, drift, season = KINDS
     for share in LOSSES:
         yield white, True, usual, share, False
     for share in (0.03, 0.05, 0.10):
         yield white, True, 0.02, share, False
-    for kind, is_known in ((wander, True), (season, True), (season, False)):
+    for kind, is_known in ((drift, True), (season, True), (season, False)):
         for share in (0.05, 0.10, 0.20):
             yield kind, is_known, usual, share, False
-    for kind, is_known in ((white, True), (wander, True), (season, False)):
+    for kind, is_known in ((white, True), (drift, True), (season, False)):
         for share in (0.05, 0.10, 0.20):
             yield kind, is_known, usual, share, True
 
@@ -268,14 +268,14 @@ def drawn(
         for one in of
         for s in one.shared
     }
-    wander = _wander(rng, kind, weeks, n)
+    drift = _drift(rng, kind, weeks, n)
     first, weather = float(rng.integers(52)), float(rng.standard_normal())
     out = []
     for week in range(weeks):
         warm = season_deg_c((first + week) * WEEK_S) + WEATHER_K * weather
         weather = WEATHER_KEPT * weather
         weather += np.sqrt(1.0 - WEATHER_KEPT**2) * float(rng.standard_normal())
-        truth = level + wander[week] + (slope * (warm - 10.0) if kind.has_season else 0.0)
+        truth = level + drift[week] + (slope * (warm - 10.0) if kind.has_season else 0.0)
         share = loss.share * ((week - at) / 52.0 if loss.is_slow else 1.0) if week >= at else 0.0
         truth[loss.element] += np.log(1.0 - share)
         some = []
@@ -296,12 +296,12 @@ def drawn(
     return out
 
 
-def _wander(rng: np.random.Generator, kind: Kind, weeks: int, n: int) -> FloatArray:
+def _drift(rng: np.random.Generator, kind: Kind, weeks: int, n: int) -> FloatArray:
     """(weeks, n) of ln EI; half of the variance common to all elements."""
-    if kind.wander_weeks is None:
+    if kind.correlation_weeks is None:
         return np.zeros((weeks, n))
     steps = np.sqrt(0.5) * (rng.standard_normal((weeks, n)) + rng.standard_normal((weeks, 1)))
-    kept = np.exp(-1.0 / kind.wander_weeks)
+    kept = np.exp(-1.0 / kind.correlation_weeks)
     out = [steps[0]]
     for step in steps[1:]:
         out.append(kept * out[-1] + np.sqrt(1.0 - kept**2) * step)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing.channels import channel_signals
-from pre_core.crossing.noise import no_force_noise, noise_path
+from pre_core.crossing.noise import no_suspension_noise, noise_path
 from pre_core.crossing.residuals import (
     SWING_MODES,
     EvaluationPoints,
@@ -198,7 +198,9 @@ def white(case: Case, residuals: FloatArray, *, is_inertial: bool = True) -> Flo
     vehicle = case.site.vehicles[0]
     truck = noise_path(case.theta, vehicle.total_mass_kg, vehicle.wheelbase_m, is_inertial)
     density = np.full(4, NOISE_UG * MICRO_G_M_PER_S2)
-    noise = whitener(rows, row_count(rows, residuals.shape[2]), truck, density, no_force_noise())
+    noise = whitener(
+        rows, row_count(rows, residuals.shape[2]), truck, density, no_suspension_noise()
+    )
     return white_rows(rows, noise, residuals)
 
 

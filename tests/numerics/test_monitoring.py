@@ -70,11 +70,11 @@ def series(
     return out
 
 
-def wandering(
-    rng: np.random.Generator, weeks: int, spread: float, memory_weeks: float
+def drifting(
+    rng: np.random.Generator, weeks: int, spread: float, correlation_weeks: float
 ) -> FloatArray:
     """(weeks, N): an Ornstein-Uhlenbeck process, half of its variance common to all elements."""
-    kept = np.exp(-1.0 / memory_weeks)
+    kept = np.exp(-1.0 / correlation_weeks)
     steps = np.sqrt(0.5) * (rng.standard_normal((weeks, N)) + rng.standard_normal((weeks, 1)))
     out = [steps[0]]
     for step in steps[1:]:
@@ -204,20 +204,20 @@ def test_usual_movements_are_found_by_their_size_and_their_slowness() -> None:
     rng = np.random.default_rng(9)
     weeks = 104
     found = []
-    for kind in ("none", "white", "wander"):
+    for kind in ("none", "white", "drift"):
         for _ in range(3):
             moves = np.zeros((weeks, N))
             if kind == "white":
                 moves = 0.015 * np.sqrt(0.5) * rng.standard_normal((weeks, N))
                 moves += 0.015 * np.sqrt(0.5) * rng.standard_normal((weeks, 1))
-            if kind == "wander":
-                moves = wandering(rng, weeks, 0.015, 26.0)
+            if kind == "drift":
+                moves = drifting(rng, weeks, 0.015, 26.0)
             outcome = detect_change(with_moves(series(rng, weeks=weeks), moves), AlarmRules())
-            found.append((outcome.usual_change, outcome.usual_wander))
-    quiet, white, wander = np.array(found).reshape(3, 3, 2).mean(axis=1)
+            found.append((outcome.usual_change, outcome.usual_drift))
+    quiet, white, drift = np.array(found).reshape(3, 3, 2).mean(axis=1)
     assert quiet.max() < 0.006
     assert white == pytest.approx([0.015, 0.0], abs=0.006)
-    assert wander == pytest.approx([0.0, 0.015], abs=0.006)
+    assert drift == pytest.approx([0.0, 0.015], abs=0.006)
 
 
 def test_change_is_printed_with_a_true_interval() -> None:
@@ -277,13 +277,13 @@ def test_ratios_are_those_of_a_filter_that_knows_of_the_change() -> None:
     periods = series(rng, weeks=30, loss=0.1, at=20)
     state = initial_baseline(periods, scales_compared())
     chart, states = empty_chart(state), []
-    wander = state.places["wander"]
+    drift = state.places["drift"]
     for number, period in enumerate(periods):
         states.append(state)
         state, kept = predict_state(state, period.time_days)
         outcome = filter_step(state, period)
         state, weight = update_state(state, outcome)
-        chart = update_chart(chart, number, kept, wander, weight, outcome, 1.0)
+        chart = update_chart(chart, number, kept, drift, weight, outcome, 1.0)
     _, log = log_ratio(chart, state, len(periods) - 1)
     assert chart.begins[-8:] == tuple(range(22, 30))
     for at, since in enumerate(chart.begins):
@@ -322,7 +322,7 @@ def test_false_alarms_are_no_more_than_stated() -> None:
     alarms = 0
     for _ in range(40):
         which = rng.choice(scales.change.size, p=np.exp(scales.log_prior))
-        moves = wandering(rng, weeks, scales.wander[which], scales.memory_days[which] / 7.0)
+        moves = drifting(rng, weeks, scales.drift[which], scales.correlation_days[which] / 7.0)
         common = rng.standard_normal((weeks, 1))
         moves += scales.change[which] * np.sqrt(0.5) * (rng.standard_normal((weeks, N)) + common)
         slope = SLOPE_SPREAD * rng.standard_normal()
@@ -332,12 +332,12 @@ def test_false_alarms_are_no_more_than_stated() -> None:
     assert alarms <= 10
 
 
-@pytest.mark.parametrize("memory_weeks", [8.0, 26.0])
-def test_stiffness_that_wanders_is_no_change(memory_weeks: float) -> None:
+@pytest.mark.parametrize("correlation_weeks", [8.0, 26.0])
+def test_stiffness_that_drifts_is_no_change(correlation_weeks: float) -> None:
     rng = np.random.default_rng(21)
     alarms = 0
     for _ in range(30):
-        moves = wandering(rng, 104, 0.012, memory_weeks)
+        moves = drifting(rng, 104, 0.012, correlation_weeks)
         alarms += (
             detect_change(with_moves(series(rng, weeks=104), moves), AlarmRules()).change
             is not None
@@ -404,9 +404,9 @@ def test_periods_are_judged_behind_training_or_behind_a_year() -> None:
 
 
 def test_months_that_are_missing_widen_what_is_not_known() -> None:
-    """A wander goes on while nobody looks: half a year later less is known."""
+    """A drift goes on while nobody looks: half a year later less is known."""
     rng = np.random.default_rng(27)
-    moves = wandering(rng, 60, 0.02, 20.0)
+    moves = drifting(rng, 60, 0.02, 20.0)
     periods = with_moves(series(rng, own=0.01), moves)
     state = taught(initial_baseline(periods, scales_compared()), periods[:52])
     near = filter_step(predict_state(state, periods[51].time_days + 7.0)[0], periods[52])

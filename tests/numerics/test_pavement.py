@@ -5,7 +5,7 @@ import pytest
 
 from pre_core.crossing import mismatch as mm
 from pre_core.crossing.mismatch import BridgePavement
-from pre_core.crossing.noise import no_force_noise, noise_spectrum
+from pre_core.crossing.noise import no_suspension_noise, noise_spectrum
 from pre_core.crossing.pavement import RATIO_SPREAD, TILT_SPREAD, fit_ratio, parts_of
 from pre_core.crossing.rows import RESIDUALS, phases, row_filter
 from pre_core.crossing.whitening import whitener
@@ -34,7 +34,7 @@ def mean_of(road: mm.Mismatch, n: float) -> float:
 def test_factor_is_that_of_a_dense_covariance() -> None:
     rows = row_filter(STEP_S)
     road = with_pavement(np.array([np.log(2.5), 0.1]))
-    noise = whitener(rows, COUNT, truck(), QUIET, no_force_noise(), road)
+    noise = whitener(rows, COUNT, truck(), QUIET, no_suspension_noise(), road)
     n, width = noise.factor.shape
     factor = np.zeros((n, n))
     for i in range(n):
@@ -42,7 +42,9 @@ def test_factor_is_that_of_a_dense_covariance() -> None:
         factor[i, low : i + 1] = noise.factor[i, low - i + width - 1 :]
     turn = phases(rows, mm.correlation_time_s(road))
     weights = [1.0 - share(), share()]
-    of_sensors = noise_spectrum(truck(), QUIET, no_force_noise(), None, rows.omega) * rows.power
+    of_sensors = (
+        noise_spectrum(truck(), QUIET, no_suspension_noise(), None, rows.omega) * rows.power
+    )
     lags = turn.shape[1]
     expected = np.zeros((n, n))
     covariance = (of_sensors @ turn).real
@@ -65,8 +67,8 @@ def test_factor_is_that_of_a_dense_covariance() -> None:
 
 def test_same_pavement_gives_the_same_noise_away_from_the_ends() -> None:
     rows, road = row_filter(STEP_S), of_level(true_level("A"))
-    plain = whitener(rows, COUNT, truck(), QUIET, no_force_noise(), road)
-    same = whitener(rows, COUNT, truck(), QUIET, no_force_noise(), with_pavement(SAME))
+    plain = whitener(rows, COUNT, truck(), QUIET, no_suspension_noise(), road)
+    same = whitener(rows, COUNT, truck(), QUIET, no_suspension_noise(), with_pavement(SAME))
     before = slice(0, RESIDUALS * 100)
     np.testing.assert_allclose(same.factor[before], plain.factor[before], rtol=1e-6, atol=1e-9)
     # The window, which spreads the longest waves, acts twice on the spectrum of the bridge.

@@ -14,11 +14,11 @@ from pre_core.crossing.noise import (
     _folded,
     mismatch_levels,
     mismatch_power,
-    no_force_noise,
+    no_suspension_noise,
     noise_path,
     noise_spectrum,
 )
-from pre_core.crossing.off_bridge import MIN_MISMATCH_GAIN
+from pre_core.crossing.off_bridge import MIN_MISMATCH_STATISTIC
 from pre_core.crossing.rows import RESIDUALS, filter_rows, row_count, row_filter
 from pre_core.crossing.whitening import white_rows, whitener
 from pre_core.physics.models import from_models
@@ -109,7 +109,7 @@ def test_rows_of_drawn_surfaces_become_white() -> None:
         if noise is None:
             count = row_count(rows, difference.size)
             road = of_level(true_level("A"))
-            noise = whitener(rows, count, truck(), QUIET, no_force_noise(), road)
+            noise = whitener(rows, count, truck(), QUIET, no_suspension_noise(), road)
         residuals = np.zeros((RESIDUALS, difference.size))
         residuals[0] = difference
         white = white_rows(rows, noise, residuals).reshape(-1, RESIDUALS)[:, 0]
@@ -132,7 +132,7 @@ def test_levels_of_drawn_surfaces() -> None:
             rows, truck(), QUIET, of_level(0.0), [filtered(drive.difference)],
             [filtered(drive.front)],
         )  # fmt: skip
-        assert gain > 10.0 * MIN_MISMATCH_GAIN
+        assert gain > 10.0 * MIN_MISMATCH_STATISTIC
         shapes = mm.mismatch_spectra(FRONT, REAR)
         found.append(mm.two_parameter_spectrum(mm.Mismatch(shapes, level, SPEED))[0])
     wanted = mm.two_parameter_spectrum(of_level(true_level("A")))[0]
@@ -143,7 +143,7 @@ def test_levels_of_drawn_surfaces() -> None:
 def test_sensors_noise_is_no_mismatch() -> None:
     rows, one = row_filter(STEP_S), truck()
     density = np.full(4, 25.0 * 9.80665e-6)
-    noise = whitener(rows, 200, one, density, no_force_noise())
+    noise = whitener(rows, 200, one, density, no_suspension_noise())
     rng = np.random.default_rng(5)
     gains = []
     for _ in range(40):
@@ -156,7 +156,7 @@ def test_sensors_noise_is_no_mismatch() -> None:
         road = filtered(driven(1, 900).front)
         stretch = values[::RESIDUALS]
         gains.append(mismatch_levels(rows, one, density, of_level(0.0), [stretch], [road])[1])
-    assert max(gains) < MIN_MISMATCH_GAIN
+    assert max(gains) < MIN_MISMATCH_STATISTIC
 
 
 @pytest.mark.parametrize("unknown", [3, 5, 7])
@@ -167,7 +167,7 @@ def test_pull_of_the_mismatch_against_drawn_spectra(unknown: int) -> None:
     right, wrong = truck(), truck(unknown, 0.01)
     wheelbase = paper_site().vehicles[0].wheelbase_m
     expected_power = mismatch_power(
-        rows, [right, wrong], np.zeros((2, 4)), np.zeros((2, 4)), QUIET, no_force_noise(),
+        rows, [right, wrong], np.zeros((2, 4)), np.zeros((2, 4)), QUIET, no_suspension_noise(),
         road, wheelbase, [0],
     )[0]  # fmt: skip
     omega = _folded(rows, 4000).below
@@ -193,7 +193,7 @@ def test_pull_of_the_mismatch_against_drawn_spectra(unknown: int) -> None:
     )
     seen = residuals(felt)
     change = residuals(np.einsum("fij,jsf->isf", mixing, felt)) - seen
-    spectrum = noise_spectrum(right, QUIET, no_force_noise(), road, omega) / omega**4
+    spectrum = noise_spectrum(right, QUIET, no_suspension_noise(), road, omega) / omega**4
     weight = np.linalg.inv(np.moveaxis(spectrum, 2, 0))
     drawn = np.einsum("isf,fij,jsf->sf", seen.conj(), weight, change).real / SPEED
     mean, error = drawn.mean(), drawn.mean(axis=1).std() / np.sqrt(drawn.shape[0])

@@ -17,7 +17,7 @@ from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing.channels import A_1, A_2, A, V, Z, channel_signals
 from pre_core.crossing.noise import (
     NoisePath,
-    no_force_noise,
+    no_suspension_noise,
     noise_power,
 )
 from pre_core.crossing.rows import (
@@ -39,7 +39,7 @@ from services.simulation.drive import beam_of, paper_site, truck_of
 FloatArray = NDArray[np.float64]
 
 DENSITY_UG = np.array([25.0, 40.0, 60.0, 30.0])
-"""Four different ones: exchanged channels would show."""
+"""Four different ones: swapped channels would show."""
 RATES_HZ = (100.0, 200.0, 250.0, 500.0, 1000.0, 2000.0)
 BETWEEN_AXLES_S = 0.44
 
@@ -113,7 +113,7 @@ def case(
         row_count(rows, model.signals.shape[2] - round(BETWEEN_AXLES_S / model.step_s)),
         declared,
         density_ug * MICRO_G_M_PER_S2,
-        no_force_noise(),
+        no_suspension_noise(),
     )
     return Case(rate_hz, rows, noise, samples, declared.is_inertial)
 
@@ -169,7 +169,7 @@ def test_twice_the_declared_density_gives_a_quarter() -> None:
     assert np.mean(white**2) == pytest.approx(0.25, abs=4.0 * 0.25 * np.sqrt(2.0 / white.size))
 
 
-def test_exchanged_densities_are_noticed() -> None:
+def test_swapped_densities_are_noticed() -> None:
     """Negative control: with the densities of the axles on the wrong channels nothing is white."""
     noise = case(1000.0, 6001, density_ug=DENSITY_UG[[2, 3, 0, 1]])
     white = np.concatenate([white_noise_rows(noise, seed) for seed in range(4)])
@@ -324,7 +324,7 @@ def test_a_whitener_for_other_rows_is_refused() -> None:
 
 def test_densities_of_zero_are_refused() -> None:
     with pytest.raises(ValueError, match="densities above zero"):
-        whitener(row_filter(3e-3), 20, declared_truck(), np.zeros(4), no_force_noise())
+        whitener(row_filter(3e-3), 20, declared_truck(), np.zeros(4), no_suspension_noise())
 
 
 def changed_trucks() -> list[NoisePath]:
@@ -348,11 +348,11 @@ def test_power_of_the_noise_of_other_trucks() -> None:
     density[-1, 2] *= 1.1  # and the declared truck with one sensor noisier
     trucks.append(trucks[0])
     which = list(range(len(trucks) - 1))
-    ours = noise_power(rows, trucks, density, no_force_noise(), which)
+    ours = noise_power(rows, trucks, density, no_suspension_noise(), which)
     traces = []
     for count in (80, 140):
         dense = [
-            dense_covariance(whitener(rows, count, one, d, no_force_noise()))
+            dense_covariance(whitener(rows, count, one, d, no_suspension_noise()))
             for one, d in zip(trucks, density, strict=True)
         ]
         traces.append([np.trace(np.linalg.solve(dense[0], dense[1 + k])) for k in which])
@@ -372,7 +372,7 @@ def test_slope_of_the_noise_power_is_that_of_drawn_noise() -> None:
     drawn = np.mean([3.0 * np.mean(white_noise_rows(here, seed) ** 2) for seed in range(12)])
     density = np.tile(DENSITY_UG * MICRO_G_M_PER_S2, (2, 1))
     (expected,) = noise_power(
-        here.rows, [declared, declared_truck()], density, no_force_noise(), [0]
+        here.rows, [declared, declared_truck()], density, no_suspension_noise(), [0]
     )
     n = 12 * here.noise.reciprocal.size
     assert abs(expected) > 0.05

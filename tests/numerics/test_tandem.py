@@ -12,7 +12,7 @@ import pytest
 
 from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import front_axle, posterior
-from pre_core.crossing.noise import no_force_noise
+from pre_core.crossing.noise import no_suspension_noise
 from pre_core.crossing.off_bridge import off_bridge_residuals, surface_level_at
 from pre_core.crossing.posterior import ChainageFixes, PosteriorProblem, Priors
 from pre_core.crossing.preparation import (
@@ -259,7 +259,7 @@ def test_profiles_of_the_tandem_agree_at_the_truth() -> None:
 def test_profiles_agree_on_springs_of_their_own_without_friction() -> None:
     problem, y = build_problem(inputs_of(driven(0.0, False)))
     for _ in range(3):
-        problem = update_noise(problem, y, no_force_noise())
+        problem = update_noise(problem, y, no_suspension_noise())
     white = posterior.data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)
     before, behind = off_bridge_residuals(problem, y)
     on = slice(before.stop, behind.start)

@@ -381,7 +381,7 @@ def profiles(strips: list[Strip], seeds: int, spacing_m: float, count: int) -> F
 
 
 def cross_spectra(heights: Floats, spacing_m: float) -> tuple[Floats, NDArray[np.complex128]]:
-    """Wave numbers (f,) and one-sided cross spectra (f, strips, strips) in m³, windowed."""
+    """Spatial frequencies (f,) and one-sided cross spectra (f, strips, strips) in m³, windowed."""
     count = heights.shape[-1]
     window = np.hanning(count) ** 2
     waves = np.fft.rfft(heights * window, axis=-1)

@@ -229,7 +229,7 @@ def test_history_reaches_the_watchers(
     start_logger(start, endpoint, tmp_path / "live.mcap")
     site = ["--site", str(project / "docs/site.example.toml")]
     serve = ["alarm", "serve", "--history", str(history), "--endpoint", endpoint]
-    stands = r"alarm of bridge-1: element 4 is \d+ % weaker than before 2025-04.*: active$"
+    stands = r"alarm of bridge-1: element 4 is \d+ % less stiff than before 2025-04.*: active$"
     noted = r"alarm of bridge-1: element 4 is .*: acknowledged by the owner$"
     with (
         RunningCommand("watch", *realm) as early,

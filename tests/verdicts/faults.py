@@ -321,7 +321,7 @@ def _with_slow_channel(
 
 
 def swapped(a: str, b: str) -> Fault:
-    """Two plugs are exchanged."""
+    """Two plugs are swapped."""
     return Fault(channels=lambda channels, _: channels | {a: channels[b], b: channels[a]})
 
 

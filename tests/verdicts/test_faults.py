@@ -67,7 +67,7 @@ TABLE: dict[str, Row] = {
     "wheelbase +3 %": Row(believed(wheelbase_m=1.03), MISFIT | {"implausible_vehicle"}),
     "wheelbase -3 %": Row(believed(wheelbase_m=0.97), MISFIT | {"implausible_vehicle"}),
     **{
-        f"{a} and {b} exchanged": Row(faults.swapped(a, b), frozenset({"channel_swapped"}))
+        f"{a} and {b} swapped": Row(faults.swapped(a, b), frozenset({"channel_swapped"}))
         for a, b in combinations(CHANNELS, 2)
     },
     **{f"{a} inverted": Row(faults.inverted(a), frozenset({"channel_inverted"})) for a in CHANNELS},

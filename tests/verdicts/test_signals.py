@@ -55,7 +55,7 @@ def accused(seed: int | None, fault: Fault = faults.NOTHING) -> dict[Reason, str
     )
 
 
-def axles_exchanged(channels: dict[str, faults.Floats], _: faults.Floats) -> faults.Channels:
+def axles_swapped(channels: dict[str, faults.Floats], _: faults.Floats) -> faults.Channels:
     """The truck's front is called its rear."""
     return {S1: channels[S2], S2: channels[S1], U1: channels[U2], U2: channels[U1]}
 
@@ -70,7 +70,7 @@ BROKEN: dict[str, tuple[Fault, Reason]] = {
         f"{a} for {b}": (faults.swapped(a, b), Reason.CHANNEL_SWAPPED)
         for a, b in combinations(CHANNELS, 2)
     },
-    "axles exchanged": (Fault(channels=axles_exchanged), Reason.CHANNEL_SWAPPED),
+    "axles swapped": (Fault(channels=axles_swapped), Reason.CHANNEL_SWAPPED),
     **{f"{a} inverted": (faults.inverted(a), Reason.CHANNEL_INVERTED) for a in CHANNELS},
     "front axle inverted": (Fault(channels=front_inverted), Reason.CHANNEL_INVERTED),
     **{f"{a} saturated": (faults.saturated(a), Reason.SENSOR_SATURATED) for a in CHANNELS},
@@ -116,7 +116,7 @@ OTHER = [1, 3, 6]  # 15 t at 500 Hz, 10 t at 1 kHz and 21 m/s, 9 t with a soft f
 
 @pytest.mark.parametrize("seed", OTHER)
 @pytest.mark.parametrize(
-    "name", [f"{S1} for {S2}", "axles exchanged", f"{U2} inverted", f"{U1} saturated"]
+    "name", [f"{S1} for {S2}", "axles swapped", f"{U2} inverted", f"{U1} saturated"]
 )
 def test_a_broken_channel_of_another_truck_is_named(name: str, seed: int) -> None:
     fault, reason = BROKEN[name]

@@ -28,8 +28,8 @@ _WHAT = ("check", "list", "ack", "serve")
 _MAX_LINES = 20
 """Maximum number of listed bridges without monitoring."""
 _HOW = (
-    "see it: driveby history BRIDGE --period week --figures DIR; look at the bridge, then: "
-    "driveby alarm ack BRIDGE --by NAME --note TEXT"
+    "see it: driveby history BRIDGE --period week --figures DIR; inspect the bridge, then "
+    "acknowledge the alarm: driveby alarm ack BRIDGE --by NAME --note TEXT"
 )
 
 
@@ -62,8 +62,8 @@ class AlarmOptions:
         metavar="PERIODS",
     )
     at_least: float = opt(
-        "smallest change of EI of interest; an alarm is raised when a change is larger with "
-        "97.5 %% probability (default: 5)",
+        "smallest change of EI of interest in per cent; an alarm also requires that the change "
+        "exceeds it with 97.5 %% probability (default: 5)",
         number("a change in per cent", low=0.0, high=50.0),
         default=5.0,
         metavar="PERCENT",

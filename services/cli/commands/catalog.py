@@ -23,7 +23,7 @@ _NS_PER_S = 1_000_000_000
 class CatalogOptions:
     """Options of `driveby catalog`: a folder of recordings, and the listing."""
 
-    folder: str = positional("folder with recordings below", metavar="DIR|s3://…")
+    folder: str = positional("folder searched recursively for recordings", metavar="DIR|s3://…")
     verify: bool = flag(
         "read every recording and compare it with its catalogue row, even where size and time agree"
     )

@@ -28,8 +28,8 @@ class CheckOptions:
         "write a commented site file to start from, and check nothing", "NEW.toml"
     )
     truck: str | None = opt(
-        "with --template: fill in springs, dampers, axle masses and tyres of a usual lorry with "
-        "two axles, known to 30 %%",
+        "with --template: fill in springs, dampers, axle masses and tyres of a typical "
+        "two-axle lorry, with spreads of 30 %%",
         choices=("lorry-single", "lorry-twin"),
     )
     json: bool = flag("print all findings as JSON")

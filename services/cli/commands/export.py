@@ -22,7 +22,7 @@ class ExportOptions:
     """Options of `driveby export`: recordings and results, and the folder for the files."""
 
     sources: tuple[Path, ...] = positional(
-        "recordings, folders with recordings below, and at most one results file",
+        "recordings, folders searched recursively for them, and at most one results file",
         Path,
         nargs="+",
         metavar="REC.mcap|RESULTS.json|DIR",
@@ -98,7 +98,7 @@ def _read(options: ExportOptions) -> _Found:
         runs = [run for path in recordings for run in signals_of_recording(path, next_file())]
     passings = []
     if results is None and site is not None:
-        with reading_bar("looking for crossings", recordings) as next_file:
+        with reading_bar("searching for crossings", recordings) as next_file:
             every = (summarise_recording(one, site, progress=next_file()) for one in recordings)
             passings = [passing for summary in every for passing in summary.passings]
     return _Found(site, results, runs, passings)

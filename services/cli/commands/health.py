@@ -30,7 +30,8 @@ class HealthOptions:
     """Services whose health is queried, and the form of the answer."""
 
     service: str | None = positional(
-        "the service's --id, such as logger or worker; with --metrics all without it",
+        "name of the service (its --id), such as logger; may be omitted with --metrics, which then "
+        "queries all",
         nargs="?",
         metavar="ID",
     )

@@ -35,8 +35,8 @@ class HistoryOptions:
     """Results to add, or a bridge to show."""
 
     words: tuple[str, ...] = positional(
-        "a bridge to show, or add and results to add: files, or folders of identify --into; "
-        "nothing: all bridges in a table",
+        "bridge to show; or add, followed by results files or folders of identify --into; if "
+        "omitted, a table of all bridges",
         nargs="*",
         metavar="BRIDGE | add RESULTS …",
     )

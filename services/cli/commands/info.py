@@ -27,7 +27,10 @@ class InfoOptions:
     """Recordings to summarise."""
 
     paths: tuple[Path, ...] = positional(
-        "recordings, or folders with recordings below", Path, nargs="+", metavar="REC.mcap|DIR"
+        "recordings, or folders searched recursively for recordings",
+        Path,
+        nargs="+",
+        metavar="REC.mcap|DIR",
     )
     site: Path | None = site_option("site file of the bridges (default: that of each recording)")
     json: bool = flag("print all findings as JSON")

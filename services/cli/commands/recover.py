@@ -1,4 +1,4 @@
-"""The command `driveby recover`: rewrite a damaged recording for every reader."""
+"""The command `driveby recover`: a new, readable file from a damaged recording."""
 
 import json
 from dataclasses import dataclass
@@ -18,9 +18,11 @@ EXIT_CLEAN, EXIT_LOSSY = 0, 3
 
 @dataclass(frozen=True, kw_only=True)
 class RecoverOptions:
-    """Options of `driveby recover`: a recording to rewrite, and its treatment."""
+    """Options of `driveby recover`: a damaged recording, and its treatment."""
 
-    recording: Path = positional("recording to rewrite; left as it is", Path, metavar="REC.mcap")
+    recording: Path = positional(
+        "damaged recording to read, which is not changed", Path, metavar="REC.mcap"
+    )
     output: Path | None = output_option(
         "recording to write (default: REC.recovered.mcap next to it)",
         "OUT.mcap",

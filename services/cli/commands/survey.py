@@ -61,13 +61,14 @@ class SurveyPlanOptions:
         metavar="UG_PER_RTHZ",
     )
     wander: float = opt(
-        "lateral standard deviation between runs in m; wander adds information (default: 0.12)",
+        "lateral wander: standard deviation of the lateral position between runs in m; more "
+        "wander averages out more of the profile mismatch (default: 0.12)",
         number("a standard deviation in m", low=0.01, high=1),
         default=0.12,
         metavar="M",
     )
     figure: Path | None = output_option(
-        "file of a figure of detection probability over the number of crossings",
+        "file of a figure of detection probability against the number of crossings",
         "OUT.png|OUT.svg",
         PNG,
         SVG,

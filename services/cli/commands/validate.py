@@ -92,13 +92,19 @@ class ValidateOptions:
         "JSON file of the table", "OUT.json", VALIDATION_JSON, AIMS_JSON
     )
     figures: Path | None = output_folder_option("folder for figures")
-    particles: int = opt("number of particles (default: 500)", whole("particles", 1), default=500)
-    steps: int = opt("number of steps (default: 600)", whole("steps", 1), default=600)
+    particles: int = opt(
+        "particles of the paper's random-walk search (default: 500)",
+        whole("particles", 1),
+        default=500,
+    )
+    steps: int = opt(
+        "steps of the paper's random-walk search (default: 600)", whole("steps", 1), default=600
+    )
     seed: int = seed_option()
     method: str | None = opt(
         "paper: the paper's search and least squares, without sensors; pre: coverage of its "
-        "intervals (exit code 1 if a criterion is not met; the options below) (default: paper, and "
-        "with --site neither, but site validation)",
+        "intervals (exit code 1 if a criterion is not met; the options below) (default: paper; "
+        "with --site and no --method a site validation runs instead)",
         choices=("paper", "pre"),
     )
     truck: str | None = opt(
@@ -126,7 +132,7 @@ class ValidateOptions:
         default=0,
     )
     effects: tuple[str, ...] = opt(
-        f"effects: {', '.join(EFFECTS)} (default: all)",
+        f"out-of-model effects, see docs/validation.md: {', '.join(EFFECTS)} (default: all)",
         _some_of(EFFECTS),
         default=EFFECTS,
         metavar="all|swing,friction,…",
@@ -145,7 +151,7 @@ class ValidateOptions:
         default=0,
     )
     kinds: tuple[str, ...] = opt(
-        f"kinds of survey: {', '.join(_KINDS)} (default: all)",
+        f"kinds of survey, see studies/surveys.md: {', '.join(_KINDS)} (default: all)",
         _some_of(_KINDS),
         default=_KINDS,
         metavar="all|twin,steady,…",

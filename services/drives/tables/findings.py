@@ -49,8 +49,8 @@ class Findings:
         columns = self._columns[part.name]
         columns[name] = columns[name].model_copy(update=values)
 
-    def exchange(self, part: TablePart, one: str, other: str) -> None:
-        """Exchange the columns of two quantities."""
+    def swap(self, part: TablePart, one: str, other: str) -> None:
+        """Swap the columns of two quantities."""
         columns = self._columns[part.name]
         columns[one], columns[other] = columns[other], columns[one]
 

@@ -190,7 +190,7 @@ def speed_unit(ratio: float) -> str | None:
 
 
 def speeds_of_positions(latitude: Floats, longitude: Floats, time_s: Floats) -> Floats:
-    """Return the slopes of positions (n,) over a second before and behind each fix, m/s."""
+    """Return the slopes of positions (n,) over a second before and after each fix, m/s."""
     north, west = on_plane_m(latitude, longitude)
     first = np.searchsorted(time_s, time_s - 1.0, side="left")
     last = np.searchsorted(time_s, time_s + 1.0, side="right")
@@ -211,7 +211,7 @@ class ReadAs(NamedTuple):
     """Interpretation of the columns of latitude and longitude."""
 
     unit: Angle
-    is_exchanged: bool
+    is_swapped: bool
     signs: tuple[float, float]
     """Factors of latitude and longitude, -1 where the sign is turned."""
     distance_m: float
@@ -244,14 +244,14 @@ def coordinates(
         for signs in turned
         for swapped in (False, True)
         for one in units
-        for pair in [_ordered(degrees(first, one), degrees(second, one), exchange=swapped)]
+        for pair in [_ordered(degrees(first, one), degrees(second, one), swap=swapped)]
     ]
     near = [one for one in found if one.distance_m < NEAR_M]
     return near[0] if near else found[0]
 
 
-def _ordered(first: Floats, second: Floats, *, exchange: bool) -> tuple[Floats, Floats]:
-    return (second, first) if exchange else (first, second)
+def _ordered(first: Floats, second: Floats, *, swap: bool) -> tuple[Floats, Floats]:
+    return (second, first) if swap else (first, second)
 
 
 def nearest_m(latitude: Floats, longitude: Floats, bridges: Iterable[Bridge]) -> float:

@@ -30,17 +30,17 @@ def track(
     given = [part.found.columns[name] for name in ("latitude_deg", "longitude_deg")]
     has_signs = any(one.factor is not None or one.side is not None for one in given)
     read = judged.coordinates(first, second, target.site, unit, has_signs=has_signs)
-    if read.is_exchanged and declared_unit.column is not None:
+    if read.is_swapped and declared_unit.column is not None:
         read = judged.coordinates(
             first, second, target.site, unit or "deg", has_signs=has_signs
-        )._replace(is_exchanged=False)
+        )._replace(is_swapped=False)
     if read.unit != "deg" and unit is None:
         found.guess(part, f"coordinates are in {read.unit}: they are near a bridge then")
     latitude, longitude = judged.degrees(first, read.unit), judged.degrees(second, read.unit)
-    if read.is_exchanged:
+    if read.is_swapped:
         latitude, longitude = longitude, latitude
-        found.guess(part, "latitude and longitude are exchanged: they are near a bridge then")
-        found.exchange(part, "latitude_deg", "longitude_deg")
+        found.guess(part, "latitude and longitude are swapped: they are near a bridge then")
+        found.swap(part, "latitude_deg", "longitude_deg")
     latitude, longitude = read.signs[0] * latitude, read.signs[1] * longitude
     for name, sign in zip(("latitude_deg", "longitude_deg"), read.signs, strict=True):
         found.column(part, name, unit=read.unit)

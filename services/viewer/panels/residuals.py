@@ -16,8 +16,8 @@ from services.viewer.crossing_scene import CrossingScene, Panel
 from services.viewer.crossing_view import FloatArray, ResidualCells
 from services.viewer.rerun_parts import RerunStream, flat_view, log_labels
 
-_KINDS = ("roads", "front body", "rear body")
-_STRETCHES = ("before", "on", "behind")
+_KINDS = ("profiles", "front body", "rear body")
+_STRETCHES = ("before", "on", "after")
 _PIXELS = 40
 """Height and width of a bin in pixels; fewer would be drawn blurred."""
 _SHADES = ((0.0, (30, 58, 82)), (3.0, (58, 78, 92)), (6.0, (213, 94, 0)))
@@ -54,7 +54,7 @@ def _log(recording: RerunStream, scene: CrossingScene, cells: ResidualCells) -> 
     names = [f"{kind}, {stretch}" for kind in _KINDS for stretch in _STRETCHES]
     log_labels(recording, f"{entity}/name", names, np.full(down.size, -1.5), down - 0.35)
     chi2 = "–" if crossing.chi2_per_dof is None else f"{crossing.chi2_per_dof:.2f}"
-    wording = [f"χ² of all rows {chi2}; 1 is expected everywhere", "Hz"]
+    wording = [f"reduced chi-square of all residuals {chi2}; 1 is expected everywhere", "Hz"]
     places = np.array([0.7, -1.5]), np.array([down[-1] + 0.75, -0.85])
     log_labels(recording, f"{entity}/chi2", wording, *places)
 

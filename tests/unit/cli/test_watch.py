@@ -145,8 +145,8 @@ def test_old_samples_are_explained() -> None:
     drives(watched, "truck-1", lag_s=1356.0)
     lines = drawn(watched)
     assert line(lines, "truck-1").endswith("23 min")
-    (why,) = [one for one in lines if "samples are old when they come" in one]
-    assert "played faster than real, sent late, or a clock is off" in why
+    (why,) = [one for one in lines if "samples are old on arrival" in one]
+    assert "replayed faster than real time, sent late, or a clock is wrong" in why
     replayed = drawn(watched, listened=Listened("replay-monday"))
     assert line(replayed, "truck-1").endswith("replay")
     assert not any("samples are old" in one for one in replayed)
@@ -197,7 +197,7 @@ def test_what_cannot_be_read_is_left_out() -> None:
     assert not watched.services
 
 
-SENTENCE = "element 4 is 10 % weaker than before 2026-08-27, interval 8 to 12 %"
+SENTENCE = "element 4 is 10 % less stiff than before 2026-08-27, interval 8 to 12 %"
 
 
 def test_an_alarm_is_a_line_until_it_is_another(site: Site) -> None:

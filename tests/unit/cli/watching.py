@@ -97,8 +97,8 @@ def estimate(crossing: CrossingResult) -> BusMessage:
 
 WEAK_FINDING = (
     "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements, "
-    "interval 57 to 62 %. No other element differs clearly (at most 3 %); "
-    "only losses above 16 % would show."
+    "interval 57 to 62 %. No other element differs clearly (estimates within 3 %); "
+    "each would show a 16 % loss."
 )
 
 
@@ -185,8 +185,8 @@ def a_fleet(site: Site) -> RealmModel:
     drives(watched, "truck-3", ago_s=300.0)
     rng = np.random.default_rng(4)
     quiet = (
-        "No element differs clearly from the others (at most {} %); "
-        "only losses above 14 % would show."
+        "No element differs clearly from the others (estimates within {} %); "
+        "each would show a 14 % loss."
     )
     for number, bridge in enumerate(("bridge-02", "bridge-03", "bridge-11", "bridge-07")):
         ratios = 1.0 + 0.012 * rng.standard_normal(7)
@@ -196,8 +196,8 @@ def a_fleet(site: Site) -> RealmModel:
         if is_weak:
             finding = (
                 "Element 4, 12.9 to 17.1 m: 20 % less stiff than the other elements, "
-                "interval 16 to 24 %. No other element differs clearly (at most 3 %); "
-                "only losses above 14 % would show."
+                "interval 16 to 24 %. No other element differs clearly (estimates within 3 %); "
+                "each would show a 14 % loss."
             )
         of = {"bridge": bridge, "ratios": ratios}
         who = f"truck-{number % 3 + 1}"

@@ -1,4 +1,4 @@
-"""CSV drives in other units or with exchanged columns are refused."""
+"""CSV drives in other units or with swapped columns are refused."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from services.drives.runs import Run
 
 def changed(run: Run, what: str) -> Run:
     gnss = run.gnss
-    if what == "exchanged":
+    if what == "swapped":
         return run._replace(
             gnss=gnss._replace(latitude_deg=gnss.longitude_deg, longitude_deg=gnss.latitude_deg)
         )
@@ -22,7 +22,7 @@ def changed(run: Run, what: str) -> Run:
     return run._replace(channels={n: v / 9.80665 + 1.0 for n, v in run.channels.items()})
 
 
-@pytest.mark.parametrize("what", ["exchanged", "km/h", "in g"])
+@pytest.mark.parametrize("what", ["swapped", "km/h", "in g"])
 def test_contradicted_unit_or_order_is_refused(csv_example: Path, what: str) -> None:
     site = load_site(csv_example / "site.toml")
     (run,) = read_folder(csv_example)

@@ -359,11 +359,11 @@ VARIANTS: dict[str, Variant] = {
     "speed in mph": Variant(
         lambda: pair(gps=GPS | {"speed_mps": GPS["speed_mps"] / 0.44704}), "speed is in mph"
     ),
-    "latitude and longitude exchanged": Variant(
+    "latitude and longitude swapped": Variant(
         lambda: pair(
             gps=renamed(GPS, "time_s", "longitude_deg", "latitude_deg", "altitude_m", "speed_mps")
         ),
-        "latitude and longitude are exchanged",
+        "latitude and longitude are swapped",
     ),
     "coordinates in 1e-7 degrees": Variant(
         lambda: pair(

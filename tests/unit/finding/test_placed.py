@@ -200,7 +200,7 @@ def scaled(name: str, factor: float) -> Callable[[dict[str, Floats]], None]:
     return change
 
 
-def exchanged(one: str, other: str) -> Callable[[dict[str, Floats]], None]:
+def swapped(one: str, other: str) -> Callable[[dict[str, Floats]], None]:
     def change(signals: dict[str, Floats]) -> None:
         signals[one], signals[other] = signals[other], signals[one]
 
@@ -252,17 +252,17 @@ def test_sound_sensors_are_not_accused(two_sided: TwoSided) -> None:
         (scaled("unsprung_front_left", -1.0), Reason.CHANNEL_INVERTED, "unsprung_front_left"),
         (scaled("unsprung_rear_right", -1.0), Reason.CHANNEL_INVERTED, "unsprung_rear_right"),
         (
-            exchanged("unsprung_front_left", "unsprung_rear_right"),
+            swapped("unsprung_front_left", "unsprung_rear_right"),
             Reason.CHANNEL_SWAPPED,
             "unsprung_front_left and unsprung_rear_right",
         ),
         (
-            exchanged("sprung_front", "sprung_rear_left"),
+            swapped("sprung_front", "sprung_rear_left"),
             Reason.CHANNEL_SWAPPED,
             "sprung_front and sprung_rear_left",
         ),
         (
-            exchanged("sprung_front", "unsprung_front_left"),
+            swapped("sprung_front", "unsprung_front_left"),
             None,
             "sprung_front and unsprung_front_left",
         ),

@@ -281,7 +281,7 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     said = capsys.readouterr().out
     assert said.startswith("2 bridges checked, 1 new alarm\nalarm 2025")
     assert "-4-weaker of bridge-2, raised 2025-" in said
-    how = "look at the bridge, then: driveby alarm ack BRIDGE --by NAME --note TEXT\n"
+    how = "then acknowledge the alarm: driveby alarm ack BRIDGE --by NAME --note TEXT\n"
     assert said.endswith(how)
     assert "\n2 of 2 bridges watched\n" in said
     assert cli.main(["alarm", "list", *there]) == 0

@@ -156,7 +156,7 @@ def test_two_different_months_are_named_without_a_judgement(
     assert not never.is_reassuring
     assert not outcome.is_reassuring
     assert outcome.text.startswith("EI from 2026-03 to 2026-04: element 4 −")
-    assert outcome.text.endswith("Temperature and season are not taken out.")
+    assert outcome.text.endswith("not corrected for temperature or season.")
     assert cli.main(["history", "bridge-1", "--history", str(folder), "--json",
                      str(tmp_path / "h.json"), "--figures", str(tmp_path)]) == 0  # fmt: skip
     said = capsys.readouterr().out
@@ -197,7 +197,7 @@ def test_one_month_is_nothing_to_compare_with(
 
 
 def test_an_alarm_stands_until_somebody_has_taken_note_of_it(past: BridgeHistory) -> None:
-    said = "element 4 is 20 % weaker than before 2026-03-05, interval 18 to 22 %."
+    said = "element 4 is 20 % less stiff than before 2026-03-05, interval 18 to 22 %."
     standing = past._replace(alarms=(alarm(),))
     text = Seen(history_section(standing, "h-")).text
     assert f"Alarm of 2026-03-10: {said} The alarm is active: it is not acknowledged." in text

@@ -49,7 +49,7 @@ def test_the_draws_are_those_of_the_result_and_of_what_is_printed(
     for unit, digits in ((1e9, 2), (1.56e10, 3)):
         interval = f"{weak.q025 / unit:.{digits}f} … {weak.q975 / unit:.{digits}f}"
         assert re.search(rf"EI_4 .* {weak.mean / unit:.{digits}f} +{interval}", printed), printed
-    assert f"common to all elements: {100.0 * crossing.scale_error:.1f} %" in printed
+    assert f"common scale uncertainty: {100.0 * crossing.scale_error:.1f} %" in printed
     assert crossing.derived is not None
     giving = crossing.derived.probability_giving
     assert giving is not None

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from schemas.results import BridgeResult, ElementState
+from services.common.language import ENGLISH
 from services.identification.bridge_state import compared as compared_of_state
 from services.identification.comparison import (
     Comparison,
@@ -43,7 +44,7 @@ def test_a_weak_element_is_named_with_its_place_loss_and_interval() -> None:
     assert (weak.low, weak.high) == pytest.approx((0.4 * np.exp(-half), 0.4 * np.exp(half)), 1e-3)
     assert sentences(found) == [
         "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements, interval 57 to 63 %.",
-        "No other element differs clearly (at most 3 %); only losses above 16 % would show.",
+        ENGLISH.text("rest.others", within=3, loss=16),
     ]
 
 
@@ -51,14 +52,13 @@ def test_a_weak_element_is_named_with_its_place_loss_and_interval() -> None:
 def test_a_wrong_nominal_value_changes_no_comparison(guess: float) -> None:
     """Nobody knows the nominal value well: 14 % too high is no loss of 14 % everywhere."""
     found = compared(guess * RATIOS)
-    assert found.level == pytest.approx(guess)
+    assert found.median_ratio == pytest.approx(guess)
     assert [e.ratio for e in found.elements] == pytest.approx(
         [e.ratio for e in compared().elements]
     )
     assert compared(np.full(7, guess)).weak == ()
     (said,) = sentences(compared(np.full(7, guess)))
-    alike = "No element differs clearly from the others (at most 1 %)"
-    assert said == f"{alike}; only losses above 16 % would show."
+    assert said == ENGLISH.text("all.others", within=1, loss=16)
 
 
 def test_what_all_elements_have_in_common_is_no_error_of_a_comparison() -> None:
@@ -76,7 +76,7 @@ def test_a_loss_is_clear_only_if_all_of_its_interval_is() -> None:
     assert [e.number for e in compared(ratios, relative=0.01).weak] == [3]
     assert compared(ratios, relative=0.05).weak == ()
     (said,) = sentences(compared(ratios, relative=0.05))
-    assert said.startswith("No element differs clearly from the others (at most 15 %); only losses")
+    assert said.startswith(ENGLISH.text("all.others", within=15, loss=0).partition(" 0 %")[0])
 
 
 def test_the_smallest_loss_that_would_be_clear_is_clear_and_a_smaller_one_is_not() -> None:
@@ -101,9 +101,7 @@ def test_a_baseline_is_compared_with_and_its_errors_count() -> None:
     assert "than the baseline" in sentences(found)[0]
     assert compared(now).weak == ()
     unchanged = sentences(compared(np.array([1.0, 1.04, 0.97]), estimate(np.ones(3))))
-    assert unchanged == [
-        "No element has clearly changed (at most 4 %); only losses above 18 % would show."
-    ]
+    assert unchanged == [ENGLISH.text("all.baseline", within=4, loss=18)]
 
 
 def test_weak_elements_come_first_and_stiffer_ones_are_named() -> None:
@@ -212,13 +210,13 @@ def test_unresolved_elements_are_never_said_to_agree() -> None:
         "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements, interval 57 to 63 %.",
         "The loss may also be in element 5, which is adjacent and not resolved.",
         "Elements 1 and 5 are not resolved (standard deviation above 25 %).",
-        "Elsewhere only losses above 16 % would show.",
+        ENGLISH.text("rest.resolved", loss=16),
         "The overall stiffness is 0.90 of the nominal value ± 10 %.",
     ]
     sound = compared(np.ones(7))
     assert describe_comparison(sound, frozenset({7})) == [
         "Element 7 is not resolved (standard deviation above 25 %).",
-        "Elsewhere only losses above 16 % would show.",
+        ENGLISH.text("rest.resolved", loss=16),
     ]
     every = describe_comparison(sound, frozenset(range(1, 8)))
     assert every == ["No single element is resolved (standard deviation above 25 %)."]

@@ -13,7 +13,7 @@ from services.identification.fit_reasons import _place_of_misfit
         (0.9, "only on the bridge"),
         (1.5, "only on the bridge"),
         (2.0, ""),
-        (12.3, "also before and behind the bridge (χ² 12)"),
+        (12.3, "also before and after the bridge (χ² 12)"),
     ],
 )
 def test_the_text_of_a_misfit_says_where_it_is(off_bridge_chi2: float, text: str) -> None:

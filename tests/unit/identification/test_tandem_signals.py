@@ -1,4 +1,4 @@
-"""Channels of a truck with a tandem that are inverted or exchanged are found before a fit."""
+"""Channels of a truck with a tandem that are inverted or swapped are found before a fit."""
 
 from collections.abc import Callable
 from functools import cache
@@ -53,7 +53,7 @@ def test_inverted_channel_of_a_tandem_is_named(row: int) -> None:
 
 
 @pytest.mark.parametrize(("i", "k"), [(0, 1), (2, 3), (1, 2)])
-def test_exchanged_channels_of_a_tandem_are_named(i: int, k: int) -> None:
+def test_swapped_channels_of_a_tandem_are_named(i: int, k: int) -> None:
     def exchange(signals: Floats) -> Floats:
         signals[[i, k]] = signals[[k, i]]
         return signals

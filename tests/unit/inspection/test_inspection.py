@@ -70,7 +70,7 @@ def test_what_is_recognised_before_a_fit_is_recognised_here(name: str, tmp_path:
     assert wrong == [str(reason)]
 
 
-def test_exchanged_channels_are_named(tmp_path: Path) -> None:
+def test_swapped_channels_are_named(tmp_path: Path) -> None:
     case = sound()
     channels = case.run.channels
     swapped = channels | {S1: channels[U1], U1: channels[S1]}
@@ -190,7 +190,10 @@ def test_bridges_that_lie_beside_the_road(tmp_path: Path) -> None:
     run, site = case.run, case.site
     # About 30 m of the bridge go 27 m to the east and 14 m to the north.
     aside = moved(site, start_latitude_deg=9e-4, end_latitude_deg=9e-4)
-    assert "beside its line" in findings(tmp_path, run, aside)["bridge_place"][0].text
+    assert (
+        "from the line between the bearings"
+        in findings(tmp_path, run, aside)["bridge_place"][0].text
+    )
     near = moved(site, start_latitude_deg=1.2e-4, end_latitude_deg=1.2e-4)
     assert "bridge_lateral" in findings(tmp_path, run, near)
     turned = moved(site, start_latitude_deg=3e-5)

@@ -220,7 +220,7 @@ def test_other_trucks_are_tried_only_where_the_first_fails_off_the_bridge(
     assert strategies == ((full_weight,) if tried == "full weight" else everything)
 
 
-@pytest.mark.parametrize("clear", ["differs", "stopped_by_friction"])
+@pytest.mark.parametrize("clear", ["stopped_by_mismatch", "stopped_by_friction"])
 def test_clear_friction_and_mismatch_need_no_fit_off_the_bridge(
     clear: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -47,7 +47,7 @@ def test_constant_acceleration_is_recovered_exactly(
         motion.speed_m_per_s, direction * (10.0 + acceleration * t), rtol=0, atol=2e-7
     )
     np.testing.assert_allclose(motion.acceleration_m_per_s2, acceleration, rtol=0, atol=2e-6)
-    assert trajectory.misfit < 1e-6
+    assert trajectory.standardised_rms < 1e-6
 
 
 def smoother_weights(time_s: Floats, query_s: float) -> Floats:
@@ -101,7 +101,9 @@ def test_the_misfit_says_whether_the_declared_noise_is_true() -> None:
     for factor in (1.0, 3.0):
         position = 9.0 * fixes + factor * POSITION_NOISE_M * rng.standard_normal(fixes.size)
         velocity = 9.0 + factor * SPEED_NOISE_M_PER_S * rng.standard_normal(fixes.size)
-        assert fitted(fixes, position, velocity, 0.0, 30.0).misfit == pytest.approx(factor, rel=0.1)
+        assert fitted(fixes, position, velocity, 0.0, 30.0).standardised_rms == pytest.approx(
+            factor, rel=0.1
+        )
 
 
 def test_two_fixes_are_enough_and_one_is_not() -> None:

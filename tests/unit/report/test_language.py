@@ -55,6 +55,8 @@ def test_details_of_a_reason_are_kept_in_another_language() -> None:
     assert ENGLISH.reason("channel_swapped", stored) == stored
     expected = "Zwei Kanäle scheinen vertauscht zu sein: sprung_front und sprung_rear."
     assert GERMAN.reason("channel_swapped", stored) == expected
+    older = "Two channels seem to be exchanged: sprung_front and sprung_rear."
+    assert GERMAN.reason("channel_swapped", older) == expected
     assert GERMAN.reason("channel_swapped", "<b>") == "Zwei Kanäle scheinen vertauscht zu sein."
 
 

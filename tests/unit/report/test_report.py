@@ -72,9 +72,7 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
         "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements, interval 58 to 62 %."
         in text
     )
-    assert (
-        "No other element differs clearly (at most 3 %); only losses above 16 % would show." in text
-    )
+    assert ENGLISH.text("rest.others", within=3, loss=16) in text
     assert "where it is least accurate, one of 16 %." in text
     assert (
         "Bridge 30 m, 7 elements, counted from the south-west end (36.11060° N, 140.10100° E)"
@@ -89,13 +87,13 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     assert (
         "If it was built differently from the other elements, the difference is not damage." in text
     )
-    assert "Drive again on another day, in the other direction and with another truck:" in text
+    assert "Drive again on another day, in the other direction and with another truck." in text
     assert "Keep these results as a baseline" in text
     # Where there is no baseline that is said, and what it means.
     assert "each other (no baseline is stored)" in text
     assert "A loss that affects all elements equally cannot be detected without a baseline." in text
     # The evidence.
-    assert "misfit (χ² per degree of freedom) 1.02 1.02 of the residuals" in text
+    assert "reduced chi-square (χ²/dof) 1.02 1.02 mean square of the residuals" in text
     assert "weight of the suspension equations (%) 100 100 100 %" in text
     assert "rotational restraint (%) 3 and 4 3 and 4 probability" in text
     assert "R-hat 1 1 agreement" in text
@@ -110,8 +108,8 @@ def test_a_nominal_value_that_is_too_high_is_no_damage_everywhere(site: Site) ->
     sound = results_of(site, some_crossing("a"), used="a", ratios=np.full(7, 0.86))
     text = reported(site, sound).text
     assert "No element is clearly less stiff." in text
-    assert "No element differs clearly from the others (at most 1 %); only losses above" in text
-    assert "The median of all elements is 0.86 of the nominal value" in text
+    assert ENGLISH.text("all.others", within=1, loss=0).partition(" 0 %")[0] in text
+    assert "(not the overall stiffness, which is a mean) is 0.86 of the nominal value" in text
 
 
 def test_a_baseline_shows_what_all_elements_share(site: Site, tmp_path: Path) -> None:
@@ -133,7 +131,7 @@ def test_a_baseline_shows_what_all_elements_share(site: Site, tmp_path: Path) ->
     assert "No baseline is stored" not in text
     assert "compare surveys of" not in reported(site, now).text
     unchanged = reported(site, results_of(site, some_crossing("b"), used="b"), baseline=then).text
-    assert "No element has clearly changed (at most 1 %); only losses above 18 % would" in unchanged
+    assert ENGLISH.text("all.baseline", within=1, loss=18) in unchanged
     for report in (text, unchanged):
         assert "compare surveys of the same truck in the same wheel path." in report
 
@@ -343,7 +341,9 @@ def test_the_baseline_of_the_site_file_lies_beside_it(
     assert "then.json: no such file" in err
     (tmp_path / "sites" / "then.json").write_bytes(found.read_bytes())
     assert run(capsys, "report", *options)[0] == 0
-    assert "No element has clearly changed (at most 1 %)" in (tmp_path / "r.html").read_text()
+    assert (
+        "No element has clearly changed (estimates within 1 %)" in (tmp_path / "r.html").read_text()
+    )
 
 
 def test_the_baseline_of_a_recording_lies_beside_its_results(
@@ -543,7 +543,7 @@ def test_a_loss_beside_unresolved_elements_may_be_theirs(site: Site) -> None:
     assert "The loss may also be in element 3, which is adjacent and not resolved." in text
     assert (
         "Elements 1, 2, 3 and 7 are not resolved (standard deviation above 25 %). "
-        "Elsewhere only losses above 40 % would show. "
+        f"{ENGLISH.text('rest.resolved', loss=40)} "
         "The overall stiffness is 0.97 of the nominal value ± 10 %." in text
     )
     assert "differs clearly" not in text  # of what is known to a factor nothing is stated
@@ -685,7 +685,14 @@ def test_no_change_has_no_sign(site: Site) -> None:
 def test_the_words_that_are_used_are_explained_and_no_others(site: Site) -> None:
     good = reported(site, results_of(site, some_crossing("a"), some_crossing("b"), used="b")).text
     words = good.rpartition(" Words ")[2]
-    for word in ("Verdict:", "EI:", "95 % interval:", "Misfit, χ²:", "Draws:", "IRI, class"):
+    for word in (
+        "Verdict:",
+        "EI:",
+        "95 % interval:",
+        "Reduced chi-square, χ²:",
+        "Draws:",
+        "IRI, class",
+    ):
         assert word in words
     assert "Channel:" not in words
     assert "Scatter: One crossing is less precise than all together" in words
@@ -699,7 +706,7 @@ def test_the_words_that_are_used_are_explained_and_no_others(site: Site) -> None
 def test_of_a_rejected_crossing_stands_what_to_do_next(site: Site) -> None:
     rejected = some_crossing("a", verdict="rejected", reasons=("channel_swapped",))
     content = results_of(site, rejected).model_dump(mode="json")
-    said = "Two channels seem to be exchanged: sprung_front and sprung_rear."
+    said = "Two channels seem to be swapped: sprung_front and sprung_rear."
     content["crossings"][0]["reason_texts"] = [said]
     text = reported(site, Results.model_validate(content)).text
     assert f"there are no usable values. {said}" in text

@@ -312,7 +312,7 @@ def test_a_tandem_is_written_as_it_was_read(bogie: str) -> None:
     [
         (
             (BOGIE.replace("true", "false") + "shares = [0.5, 0.5]\n", SENSORS),
-            "vehicle.bogies[0].shares are of axles that share their load, remove them or set",
+            "vehicle.bogies[0].shares are of an equalised tandem, remove them or set",
         ),
         (
             (BOGIE + BOGIE, SENSORS),

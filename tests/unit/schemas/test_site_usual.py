@@ -106,14 +106,14 @@ PAIRS = [
 
 
 @pytest.mark.parametrize(("key", "value"), PAIRS)
-def test_exchanged_pair_is_named(key: str, value: str) -> None:
+def test_swapped_pair_is_named(key: str, value: str) -> None:
     text = TEXT
     if f"\n{key} = " not in text:
         text = text.replace("[bridge]", f"{key} = {value}\n\n[bridge]", 1)
     else:
         text = with_value("vehicle", key, value)
     lines = warnings_of(parse_site(text, "site.toml"))
-    assert any(f"{key}: [front, rear] exchanged?" in line for line in lines), lines
+    assert any(f"{key}: [front, rear] swapped?" in line for line in lines), lines
 
 
 def test_springs_for_tyres_are_named() -> None:
@@ -122,7 +122,7 @@ def test_springs_for_tyres_are_named() -> None:
     end = text.index("\n", begin)
     text = f"{text[:begin]}suspension_stiffness_n_per_m = [1.8e6, 3.5e6]{text[end:]}"
     lines = warnings_of(parse_site(text, "site.toml"))
-    wanted = "tyre_stiffness_n_per_m and suspension_stiffness_n_per_m exchanged?"
+    wanted = "tyre_stiffness_n_per_m and suspension_stiffness_n_per_m swapped?"
     assert any(wanted in line for line in lines), lines
 
 
@@ -131,7 +131,7 @@ def test_springs_for_tyres_are_named() -> None:
     [
         ({"total_mass_kg": "17.7"}, "in t? then it is 17700"),
         ({"rayleigh_beta_s": "2.0"}, "a damping ratio in %? then it is 0.00"),
-        ({"rayleigh_alpha_per_s": "0.0005", "rayleigh_beta_s": "0.7"}, "exchanged with the other"),
+        ({"rayleigh_alpha_per_s": "0.0005", "rayleigh_beta_s": "0.7"}, "swapped with the other"),
         ({"suspension_damping_ns_per_m": "[0.2, 0.2]"}, "in parts of critical damping? then it is"),
         ({"span_m": "30,0"}, "30,0 has a decimal comma"),
         ({"span_m": "30.0 m"}, "a number without a unit expected: 30.0"),
@@ -150,10 +150,10 @@ def test_likely_slip_is_named(changes: dict[str, str], words: str) -> None:
     assert any(words in line for line in said), said
 
 
-def test_exchanged_coordinates_of_the_ends_are_named() -> None:
+def test_swapped_coordinates_of_the_ends_are_named() -> None:
     text = (ROOT / "tests/data/csv_example/site.toml").read_text()
     swapped = text.replace("_latitude_", "_x_").replace("_longitude_", "_latitude_")
-    with pytest.raises(InputError, match=r"latitude and longitude exchanged\?$"):
+    with pytest.raises(InputError, match=r"latitude and longitude swapped\?$"):
         parse_site(swapped.replace("_x_", "_longitude_"), "site.toml")
     far = text.replace("start_latitude_deg = 47.0", "start_latitude_deg = 147.0")
     with pytest.raises(InputError, match=r"angle of at most 89 degrees; a longitude\?"):
@@ -231,4 +231,4 @@ def test_centre_of_gravity_measured_from_the_rear_axle_is_named(
 def test_single_element_is_named_with_a_usual_number() -> None:
     text = with_value("bridge", "elements", "1")
     (line,) = warnings_of(parse_site(text, "site.toml"))
-    assert "elements is 1: 7 are usual here" in line
+    assert "elements is 1: 7 are typical here" in line

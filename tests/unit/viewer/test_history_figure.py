@@ -56,7 +56,10 @@ def test_the_head_says_what_to_do_while_an_alarm_stands() -> None:
         text.get_text() for text in drawn(HistoryView("b-1", "week", points, (mark(),), ())).texts
     ]
     assert "ALARM: element 2 is weaker" in said
-    assert "Look at the bridge, then: driveby alarm ack b-1 --by NAME --note TEXT" in said
+    assert (
+        "Inspect the bridge, then acknowledge the alarm: driveby alarm ack b-1 --by NAME "
+        "--note TEXT" in said
+    )
     noted = mark("the owner, 2025-06-23", "props were put in")
     said = [
         text.get_text() for text in drawn(HistoryView("b-1", "week", points, (noted,), ())).texts

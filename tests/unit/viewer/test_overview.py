@@ -98,9 +98,13 @@ def test_the_overview_has_the_picture_of_the_bridge_and_the_finding(
 @pytest.mark.parametrize(
     ("used", "between", "origin"),
     [
-        (("a",), 0.02, "Numbers of one crossing, with between-crossing variability."),
-        (("a",), None, "Numbers of one crossing."),
-        (("a", "b"), 0.02, "Numbers of 2 crossings fused."),
+        (
+            ("a",),
+            0.02,
+            "Values from one crossing; the intervals include the between-crossing variability.",
+        ),
+        (("a",), None, "Values from one crossing."),
+        (("a", "b"), 0.02, "Values from 2 fused crossings."),
     ],
 )
 def test_numbers_name_the_crossings_that_they_are_of(

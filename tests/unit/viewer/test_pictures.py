@@ -17,7 +17,7 @@ from schemas.results import CrossingResult, Results
 from schemas.site import Site
 from schemas.site_file import load_site
 from services.cli import main as cli
-from services.common.language import language_of
+from services.common.language import ENGLISH, language_of
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.bridge_view import BridgeView, view_of_bridge
 from services.viewer.crossing_view import comparison_of, view_of_crossing
@@ -197,7 +197,7 @@ def test_a_good_crossing_says_what_is_weak_and_by_how_much(site: Site) -> None:
         draw_crossing(view_of_crossing(sound, site.bridges[0]), element_truth=None, road_truth=None)
     )
     assert "% less" not in said
-    assert "No element differs clearly from the others (at most 1 %); only losses above" in said
+    assert ENGLISH.text("all.others", within=1, loss=0).partition(" 0 %")[0] in said
 
 
 def test_what_is_not_resolved_is_an_empty_bar_and_agrees_with_nothing(site: Site) -> None:
