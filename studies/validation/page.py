@@ -154,6 +154,7 @@ Each page has its figures with their commands. No real bridge is among them.
 | truck on bridge, the paper's search | the paper's tables, a simulator that shares no code | [reproduction](../studies/reproduction.md) |
 | verdicts, weights or chains | faults, one by one | [faults](../studies/faults.md) |
 | fused intervals, forecasts, weak elements | surveys simulated whole | [surveys](../studies/surveys.md) |
+| verdicts and intervals | VBI-2D and OpenSeesPy | [other simulators](../studies/other-simulators.md) |
 | sensors left and right | a simulator with two sides | [sensors](../studies/sensors.md) |
 | site validation | made-up errors | [error rates](../studies/site-validation.md) |
 | alarms | simulated years of bridges | [alarms](../studies/alarms.md) |

@@ -55,6 +55,7 @@ NOT_RUN = {
     "python -m tests.benchmarks.alarms": LONG,
     "make year": LONG,
     "pytest tests/numerics/test_monitoring.py": ITSELF,
+    "pytest tests/verdicts/test_opensees.py -m slow": LONG,
     "pytest tests/contract/test_wheel.py -m slow": ITSELF,
     "driveby alarm ack BRIDGE --by NAME --note TEXT": (
         "needs an alarm; tests/unit/history/test_alarms.py has one"
