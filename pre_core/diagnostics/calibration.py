@@ -57,13 +57,15 @@ def root_mean_square(z: FloatArray) -> float:
     return float(np.sqrt(np.mean(z * z)))
 
 
-def rank(draws: FloatArray, truth: FloatArray) -> FloatArray:
+def rank(draws: FloatArray, truth: FloatArray, ties: FloatArray) -> FloatArray:
     """Return the share (p,) of draws (n, p) below the truth (p,): uniform for a true posterior.
 
-    Half of the draws that equal the truth count as below.
+    Of the draws that equal the truth the share `ties` (p,) counts as below. Where a posterior has a
+    point mass, ranks are uniform only if it is drawn between 0 and 1 (randomised probability
+    integral transform); with half of them ranks pile up in the middle.
     """
     below = np.mean(draws < truth, axis=0)
-    return np.asarray(below + 0.5 * np.mean(draws == truth, axis=0))
+    return np.asarray(below + ties * np.mean(draws == truth, axis=0))
 
 
 def rank_from_quantiles(truth: float, low: float, middle: float, high: float) -> float:

@@ -101,15 +101,22 @@ def record(
             }
             for name, p in estimates.items()
         },
-        "ranks": _ranks(truth, estimates, seen.draws),
+        "ranks": _ranks(truth, estimates, seen.draws, seed),
         "bound": bound,
     }
 
 
 def _ranks(
-    truth: dict[str, float], estimates: dict[str, Parameter], draws: dict[str, Floats] | None
+    truth: dict[str, float],
+    estimates: dict[str, Parameter],
+    draws: dict[str, Floats] | None,
+    seed: int,
 ) -> dict[str, float]:
-    """Return the truth's ranks among draws; without draws, as far as three quantiles allow."""
+    """Return the truth's ranks among draws; without draws, as far as three quantiles allow.
+
+    `seed` is that of the random share of ties: springs that are absent in truth and in draws.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence([seed, 0x71E5]))
     ranks = {
         name: calibration.rank_from_quantiles(truth[name], p.q025, p.q50, p.q975)
         for name, p in estimates.items()
@@ -117,7 +124,9 @@ def _ranks(
     }
     for name, values in (draws or {}).items():
         if name in truth:
-            ranks[name] = float(calibration.rank(values[:, None], np.array([truth[name]]))[0])
+            (ranks[name],) = calibration.rank(
+                values[:, None], np.array([truth[name]]), rng.uniform(size=1)
+            ).tolist()
     return ranks
 
 
@@ -193,7 +202,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "wheelbase": ("wheelbase",),
     "derived": ("f1_hz", "max_deflection_m"),
 }
-"""Parameters whose ranks are reported together; a group without draws is left out."""
+"""Parameters whose ranks are reported together, as far as the truck and the bridge have them."""
 SMALLEST_P = 0.01
 """Probability of the ranks below which a group fails, its parameters tested one by one."""
 
@@ -204,8 +213,14 @@ def elements_of(records: list[Record]) -> int:
 
 
 def groups_of(records: list[Record]) -> dict[str, tuple[str, ...]]:
-    """Return names of the parameters of each group that is tested together."""
-    return {"EI": tuple(f"EI_{e + 1}" for e in range(elements_of(records)))} | GROUPS
+    """Return the names of each group of parameters that have a rank in all usable records."""
+    usable = [line for line in records if line["estimates"]]
+    wanted = {"EI": tuple(f"EI_{e + 1}" for e in range(elements_of(records)))} | GROUPS
+    found = {
+        group: tuple(name for name in names if all(name in line["ranks"] for line in usable))
+        for group, names in wanted.items()
+    }
+    return {group: names for group, names in found.items() if usable and names}
 
 
 def scores(records: list[Record]) -> Scores:
@@ -240,11 +255,10 @@ def _table(
 def ranks_of(records: list[Record]) -> dict[str, Floats]:
     """Return the truth's ranks (crossings, parameters) in usable crossings, by group."""
     usable = [line for line in records if line["estimates"]]
-    found: dict[str, Floats] = {}
-    for group, names in groups_of(records).items():
-        if usable and all(name in line["ranks"] for line in usable for name in names):
-            found[group] = _table(usable, names, lambda line, name: line["ranks"][name])
-    return found
+    return {
+        group: _table(usable, names, lambda line, name: line["ranks"][name])
+        for group, names in groups_of(records).items()
+    }
 
 
 def rank_tests(records: list[Record]) -> dict[str, dict[str, calibration.Uniformity]]:

@@ -173,6 +173,15 @@ def test_ranks_are_tested_by_group_and_parameter() -> None:
     assert sum(tests["EI"]["EI_1"].counts) == 60
 
 
+def test_group_is_tested_without_what_a_truck_lacks() -> None:
+    records = made_up(60)
+    for line in records:
+        del line["ranks"]["share"]
+    tests = rank_tests(records)
+    assert set(tests) == {"EI", *GROUPS}
+    assert set(tests["vehicle"]) == set(GROUPS["vehicle"]) - {"share"}
+
+
 def test_conditions_and_distributions_count_what_they_say() -> None:
     records = made_up(50)
     rows = {row[0]: row for row in by_condition(records)}

@@ -15,11 +15,23 @@ from pre_core.diagnostics.calibration import (
     uniformity,
 )
 
+HALF = np.array([0.5])
 
-def test_rank_counts_draws_below_and_half_of_the_equal_ones() -> None:
+
+def test_rank_counts_draws_below_and_a_share_of_the_equal_ones() -> None:
     draws = np.array([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0], [4.0, 0.0]])
-    np.testing.assert_allclose(rank(draws, np.array([2.5, 0.0])), [0.5, 0.5])
-    np.testing.assert_allclose(rank(draws, np.array([9.0, -1.0])), [1.0, 0.0])
+    np.testing.assert_allclose(rank(draws, np.array([2.5, 0.0]), HALF), [0.5, 0.5])
+    np.testing.assert_allclose(rank(draws, np.array([2.5, 0.0]), np.array([0.5, 0.2])), [0.5, 0.2])
+    np.testing.assert_allclose(rank(draws, np.array([9.0, -1.0]), HALF), [1.0, 0.0])
+
+
+def test_ranks_are_uniform_where_the_posterior_has_a_point_mass() -> None:
+    """Truths and draws from one distribution, in which half are exactly zero."""
+    rng = np.random.default_rng(5)
+    drawn = np.abs(rng.standard_normal((501, 400))) * (rng.uniform(size=(501, 400)) < 0.5)
+    draws, truth = drawn[1:], drawn[0]
+    assert uniformity(rank(draws, truth, rng.uniform(size=400))).p_value > 0.01
+    assert uniformity(rank(draws, truth, HALF)).p_value < 1e-6
 
 
 def test_ranks_of_true_posteriors_are_uniform() -> None:
@@ -32,7 +44,7 @@ def test_ranks_of_true_posteriors_are_uniform() -> None:
         gain = 1.0 / (1.0 + noise**2)
         std = np.sqrt(1.0 - gain)
         draws = gain * data + std * rng.standard_normal((99, 2000))
-        return rank(draws, truth)
+        return rank(draws, truth, HALF)
 
     assert uniformity(ranks(0.5), 10).p_value > 0.01
     assert uniformity(ranks(0.25), 10).p_value < 1e-6  # intervals too narrow
