@@ -85,6 +85,14 @@ def test_sound_channels_show_no_step(rate_hz: float, monkeypatch: pytest.MonkeyP
     assert abs(fit.step.z) < 4.0
 
 
+@pytest.mark.parametrize(("size_s", "is_named"), [(9e-5, False), (1.1e-4, True), (-1e-3, True)])
+def test_delay_that_changes_by_less_than_a_sample_is_no_slip(size_s: float, is_named: bool) -> None:
+    nothing = np.zeros(1)
+    step = slip.Step(slip.DELAY, 0, 1.0, size_s, float(np.sign(size_s)) * 20.0)
+    fit = Fit(np.zeros((1, 3)), 0.01, nothing, 1.6, {}, 0.0, nothing, False, 0.0, step=step)
+    assert bool(checks.steps_of_channels(CHANNELS, fit)) == is_named
+
+
 def test_unit_step_is_what_a_late_channel_adds() -> None:
     """A sine that comes early by h from a sample on, integrated as the program does."""
     step_s, moment, h = 1e-3, 300, 1e-6
