@@ -47,8 +47,6 @@ NOT_RUN = {
     ),
     'pip install "driveby[history,s3]"': NETWORK,
     'pip install --upgrade "WHEEL[all]"': NETWORK,
-    "driveby validate --method pre --crossings 0 --control 0 --scenarios 1 --out-of-model 20 "
-    "--records build/effects.jsonl": LONG,
     'pytest tests/verdicts/test_faults.py -m slow -k "5 and t] or span"': LONG,
     "pip uninstall driveby": "removes what this test runs in",
     "python -m tests.benchmarks.fleet --out /tmp/fleet": LONG,
