@@ -1,10 +1,9 @@
 """Statistics of signals and residuals that decide whether an answer is reliable; no verdicts.
 
-Before the fit, from four accelerations alone: whether a channel is stuck or saturated, whether the
-channels satisfy the body equation (which has no unknown input), whether the front axle meets the
-road before the rear. After it, from the whitened residuals: their mean square for each kind of
-residual, segment of the drive and frequency band, and its significance. The thresholds belong to
-the verdicts.
+Before the fit, from four accelerations alone: whether a channel is stuck or saturated, and whether
+the channels satisfy the body equation, which has no unknown input. After it, from the whitened
+residuals: their mean square for each kind of residual, segment of the drive and frequency band, and
+its significance. The thresholds belong to the verdicts.
 """
 
 from itertools import permutations, product
@@ -25,8 +24,6 @@ _LARGEST_COUPLING = 0.6
 """Largest absolute coupling of a pair through the pitch inertia."""
 _SAME = 1e-6
 """Relative tolerance within which two channel assignments explain equally well."""
-_ROAD_BAND_HZ = (1.0, 8.0)
-"""Band in which both axles follow the road equally."""
 
 
 _FINE = 0.2
@@ -187,7 +184,7 @@ def assign_channels(
     # equally good within rounding.
     for order in sorted(permutations(range(4)), key=_moved_channels):
         s_1, s_2, u_1, u_2 = order
-        # Swapping both pairs changes neither equation: that is for `axle_correlation`.
+        # Swapping both pairs changes neither equation: that is for `same_place.axle_correlation`.
         if order in ((0, 1, 2, 3), (1, 0, 3, 2)):
             continue
         value = max(unexplained(0, s_1, u_1, s_2), unexplained(1, s_2, u_2, s_1))
@@ -337,49 +334,6 @@ def bounded_least_squares(
         if free.all() and inside[0]:
             break
     return best, least + float(np.sum(root[k:, k] ** 2))
-
-
-def axle_correlation(
-    front_m_per_s2: FloatArray,
-    rear_m_per_s2: FloatArray,
-    step_s: float,
-    travelled_m: FloatArray,
-    wheelbase_m: float,
-) -> tuple[float, float]:
-    """Return the correlation of both axles' motion at the same place, as recorded and swapped.
-
-    Below 8 Hz an axle follows the road. `travelled_m` (n,) is the increasing distance of the front
-    axle at every sample (n,); the rear axle is where the front axle was a wheelbase before. With
-    the axles swapped, the one that is named rear is in front.
-    """
-    smooth = _band_passed(np.stack([front_m_per_s2, rear_m_per_s2]), step_s, _ROAD_BAND_HZ)
-    return (
-        _correlation(smooth[0], smooth[1], travelled_m, -wheelbase_m),
-        _correlation(smooth[0], smooth[1], travelled_m, wheelbase_m),
-    )
-
-
-def _band_passed(signals: FloatArray, step_s: float, band_hz: tuple[float, float]) -> FloatArray:
-    n = signals.shape[1]
-    spectrum = np.fft.rfft((signals - signals.mean(axis=1, keepdims=True)) * np.hanning(n), axis=1)
-    frequency = np.fft.rfftfreq(n, step_s)
-    spectrum[:, (frequency < band_hz[0]) | (frequency > band_hz[1])] = 0.0
-    return np.fft.irfft(spectrum, n, axis=1)
-
-
-def _correlation(
-    front: FloatArray, rear: FloatArray, travelled_m: FloatArray, rear_offset_m: float
-) -> float:
-    """Return the correlation at the same place of signals whose places differ by an offset."""
-    rear_at = travelled_m + rear_offset_m
-    low, high = max(travelled_m[0], rear_at[0]), min(travelled_m[-1], rear_at[-1])
-    if high - low < 2.0 * abs(rear_offset_m):
-        return 0.0
-    place = np.linspace(low, high, front.size)
-    a = np.interp(place, travelled_m, front)
-    b = np.interp(place, rear_at, rear)
-    scale = np.sqrt((a @ a) * (b @ b))
-    return float(a @ b / scale) if scale > 0.0 else 0.0
 
 
 # Whitened residuals.

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.diagnostics import quality
+from pre_core.diagnostics import quality, same_place
 from pre_core.physics.simulate import Motion
 from schemas.reasons import REASON_TEXTS, Reason
 from schemas.site import Sensor, Vehicle
@@ -235,7 +235,7 @@ def scan_wheelbase(
     tried = vehicle.wheelbase_m * np.arange(*_TRIED, _STEP_M / vehicle.wheelbase_m)
     alike = np.array(
         [
-            quality.axle_correlation(
+            same_place.axle_correlation(
                 acceleration[2], acceleration[3], step_s, travelled_m, float(w)
             )[0]
             for w in tried

@@ -75,6 +75,7 @@ NOT_RUN = {
     "--tls cluster-certs/client --into identified": CLUSTER,
     "pytest tests/faults/test_cluster.py": ITSELF,
     'pip install "driveby[identify,cluster]"': NETWORK,
+    'pip install -e ".[opensees]"': NETWORK,
     "python -m tests.benchmarks.cluster_scale --crossings 2000": LONG,
     "make install": "installs what this test runs in; .ci/run begins with it",
     "make demo": "tests/process_replay/test_demo.py runs the command of the target",

@@ -12,8 +12,12 @@ from schemas.reasons import Reason
 from schemas.site import Vehicle
 from services.finding.placed import middle_names
 from services.identification.signal_checks import reasons_before_fit
+from services.simulation.drawn import default_site
+from services.simulation.drawn_tandem import TandemWorld, drawn_tandem
+from services.simulation.survey_kinds import KINDS
 from services.simulation.tandem_cases import draw_tandem
 from services.simulation.wide_crossings import drive_case, site_of
+from studies.validation.surveys import crossing_truth, site_of_truck
 
 Floats = NDArray[np.float64]
 
@@ -44,6 +48,25 @@ def inverted(*rows: int) -> Callable[[Floats], Floats]:
 @pytest.mark.parametrize("seed", [20, 23])
 def test_sound_channels_of_a_tandem_are_not_accused(seed: int) -> None:
     assert judged(seed, lambda signals: signals) == {}
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_body_that_pitches_is_judged_by_the_road(sign: float) -> None:
+    """Front and rear of this body move against each other: their correlation at a place is -0.6."""
+    kind = KINDS["tandem"]
+    site = site_of_truck(default_site(), kind, 0)
+    truth, seed = crossing_truth(site, kind, 13, 0, 0)
+    world = TandemWorld(kind.friction_share, kind.offset_m, wander_m=kind.wander_m)
+    run, _ = drawn_tandem(site, truth, seed, 13_000, world).recorded
+    signals = np.stack(list(run.channels.values()))
+    signals[0] *= sign
+    speed = np.full(signals.shape[1], truth.conditions.speed_m_per_s)
+    travelled = np.cumsum(speed) / run.rate_hz
+    motion = Motion(travelled, speed, np.zeros_like(speed))
+    vehicle = site.vehicles[0]
+    found = dict(reasons_before_fit(vehicle, signals, 1.0 / run.rate_hz, motion, 1))
+    expected = {} if sign > 0.0 else {Reason.CHANNEL_INVERTED: middle_names(vehicle)[0]}
+    assert found == expected
 
 
 @pytest.mark.parametrize("row", range(4))
