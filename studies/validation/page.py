@@ -25,8 +25,8 @@ Is the uncertainty true? This page is written by
 
     {command} --page docs/validation.md
 
-(`make validate`: 200 crossings, 64 of each effect); every figure on it comes from that run. Nothing
-here was shown on a real bridge: no public record of one is known.
+(`make validate`: 200 crossings, 64 of each effect); every figure on it comes from that run. No
+real bridge is among them: no public record of one is known.
 
 ## The aims
 
@@ -59,16 +59,13 @@ Errors are judged in ln EI, in which the prior is normal: z = (ln median − ln 
 standard deviation that the 2.5 and 97.5 % quantiles give. The common scale uncertainty (total mass,
 gain) is part of both the interval and the truth. The bound is the Cramér-Rao bound of the same
 rows, receiver and priors at the truth; the variance of a support spring is that of a normal cut
-off at zero there. Standard errors are taken between crossings, because elements of one crossing
-are not independent.
+off at zero there. Standard errors are between crossings.
 
 {elements}
 
 | | least | 5 % | median | 95 % | most |
 | --- | --: | --: | --: | --: | --: |
 {distributions}
-
-Where it holds:
 
 | crossings | number | good | coverage | rms z |
 | --- | --: | --: | --: | --: |
@@ -109,15 +106,12 @@ _WORLDS = """
 
 Crossings whose truck and bridge are drawn as above, but on free and rigid bearings and undamped
 tyres; then with one effect, or with all but the surface, torsion, left-and-right and pavement,
-which are on roads of their own. Sprung is a rotational restraint, sinking a bearing compliance,
-swing an initial vibration, tyres their damping, bilinear a damper stronger in rebound, air an air
-spring, spans more than one, surface a 2-D road surface (`services/simulation/out_of_model.py` has
-the ranges; none is a prior of the method). Answered is what is not rejected; covered is the share
+which are on roads of their own (`services/simulation/out_of_model.py` explains each and has the
+ranges, none a prior of the method). Answered is what is not rejected; covered is the share
 of the 95 % intervals of EI that hold the truth, of all that were answered and of those that are
 `good`; z is the error over the standard deviation: its mean over all elements and that of the worst
 element, its root mean square (rms), and its largest size where the verdict is `good` (max); std is
-the median relative standard deviation of EI, for the surface also over the Cramér-Rao bound at the
-truth with the profile mismatch in its noise (of bound).
+the median relative standard deviation of EI, for the surface also over its bound (of bound).
 
 | {headings} |
 | --- |{rules}
@@ -129,8 +123,8 @@ truth with the profile mismatch in its noise (of bound).
 _JUDGED = """
 ## Crossings of an independent simulator
 
-Files from a program that shares no code with this one. Each EI is allowed to be off by the
-larger of a share of its value and a number of standard deviations.
+Files of a program that shares no code with this one; EI may be off by the larger of a share of its
+value and a number of standard deviations.
 
 | run | verdict | χ² | at the truth | allowed | error | largest \\|z\\| | std/bound |
 | --- | --- | --: | --: | --- | --: | --: | --: |
@@ -146,7 +140,7 @@ Not judged in this run: the folder with them was not there.
 _ELSEWHERE = """
 ## Other evidence
 
-Each page has its figures with their commands. No real bridge is among them.
+Each page has its figures with their commands.
 
 | what | against | page |
 | --- | --- | --- |
@@ -156,11 +150,6 @@ Each page has its figures with their commands. No real bridge is among them.
 | fused intervals, forecasts, weak elements | surveys simulated whole | [surveys](../studies/surveys.md) |
 | verdicts and intervals | VBI-2D and OpenSeesPy | [other simulators](../studies/other-simulators.md) |
 | sensors left and right | a simulator with two sides | [sensors](../studies/sensors.md) |
-| site validation | made-up errors | [error rates](../studies/site-validation.md) |
-| alarms | simulated years of bridges | [alarms](../studies/alarms.md) |
-| services | load, kills, archives | [load](../studies/load.md) |
-| speed | peers, and plain NumPy | [benchmarks](../studies/benchmarks.md) |
-| the tests | one wrong token at a time | [mutants](../studies/mutants.md) |
 """  # noqa: E501 - a row of Markdown is one line
 
 
@@ -195,7 +184,11 @@ def _worlds(records: Sequence[Record]) -> str:
         line.effect: [record for record in records if record["effect"] == line.effect]
         for line in lines
     }
-    reasons = [f"{effect}: {', '.join(reasons_of(of))}" for effect, of in of_effect.items()]
+    reasons = [
+        f"{effect}: {', '.join(reasons_of(of))}"
+        for effect, of in of_effect.items()
+        if any(record["verdict"] != "good" for record in of)
+    ]
     return _WORLDS.format(
         headings=" | ".join(HEADINGS),
         rules=" --: |" * (len(HEADINGS) - 1),
