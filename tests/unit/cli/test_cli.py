@@ -208,7 +208,7 @@ def test_unusual_site_file_is_warned_of_and_used(
     arguments = ("import", drive, "--site", site, "-o", output)
     code, _, err = run(capsys, *arguments)
     assert code == 0
-    assert f"{site}: truck-x: noise 0.025 µg/√Hz: usual is" in err
+    assert f"{site}: truck-x: noise 0.025 µg/√Hz: typical is" in err
     assert "in mg/√Hz? then it is 25" in err
     code, out, _ = run(capsys, "check", site)
     assert code == 1

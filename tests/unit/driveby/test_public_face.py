@@ -320,8 +320,8 @@ def test_draws_may_be_forgotten(
     chains = {"EI_1": np.ones((2, 3))}
 
     def found_at_once(*arguments: Any) -> Any:
-        keep = arguments[-1]
-        keep(exact.results.crossings[0].crossing_id, chains)
+        executor = arguments[3]
+        executor._keep(exact.results.crossings[0].crossing_id, chains)
         return exact.results
 
     monkeypatch.setattr(identifying, "identify_drives", found_at_once)

@@ -158,7 +158,7 @@ def test_tabs_distinguish_crossings(site: Site) -> None:
 def test_the_verdict_says_doubt_first_and_the_misfit_once(site: Site) -> None:
     text = verdict_markdown(view_of(site, "suspect"))
     assert text.splitlines()[2] == "**Doubtful. Do not rely on these values.**"
-    assert text.count("χ²") == 1
+    assert text.count("reduced chi-square") == 1
     assert "Doubtful" not in verdict_markdown(view_of(site, "good"))
 
 
