@@ -308,7 +308,7 @@ def _numbers(at: Floats, sizes: list[int], sequences: list[int]) -> NDArray[np.i
 
     A batch that follows its predecessor has the next numbers, whatever the jitter of its time.
     Where batches are missing, as many samples are missing as those would have had, unless the time
-    indicates otherwise; so also where a batch starts later than its predecessor ends.
+    indicates otherwise or sizes vary; so also where a batch starts later than its predecessor ends.
     """
     usual = int(np.median(sizes))
     before = np.array(sizes[:-1], dtype=np.int64)
@@ -319,7 +319,8 @@ def _numbers(at: Floats, sizes: list[int], sequences: list[int]) -> NDArray[np.i
     jitter = np.quantile(followed, 0.5, method="lower") if followed.size else 0.0
     lost = skipped * usual
     tolerance = max(0.5, min(_JITTER * jitter, 0.5 * usual)) + _CLOCK_ERROR * lost
-    missing = np.where(np.abs(jumps - lost) < tolerance, lost, np.rint(jumps)).astype(np.int64)
+    is_expected = (np.abs(jumps - lost) < tolerance) & ((skipped == 0) | (before == usual))
+    missing = np.where(is_expected, lost, np.rint(jumps)).astype(np.int64)
     return np.concatenate([[0], np.cumsum(np.maximum(before + missing, 0))])
 
 

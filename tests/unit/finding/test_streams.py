@@ -374,6 +374,18 @@ def test_device_time_of_a_message() -> None:
         device_time_ns("gnss", b"\xff\xff")
 
 
+def test_lost_batches_of_varying_size_leave_the_later_ones_in_place() -> None:
+    """The usual size, 125, times six lost batches is one sample more than the time says."""
+    signal = np.cos(np.arange(1000) * 0.3)
+    kept = [(0, 0, 14), (7, 763, 1000)]
+    boot = boot_with(
+        [batch(k, a / 1000.0, dict.fromkeys(CHANNELS, (1000.0, signal[a:b]))) for k, a, b in kept]
+    )
+    expected = signal.copy()
+    expected[14:763] = np.nan
+    np.testing.assert_array_equal(samples(boot, -1.0, 2.0).channels[CHANNELS[0]], expected)
+
+
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_any_way_to_cut_and_shuffle_gives_the_same_arrays(data: st.DataObject) -> None:
