@@ -203,8 +203,8 @@ def of_tandem(
 ) -> dict[Reason, str]:
     """Return the reason, and the channels, if readings (4, n) of a tandem are mixed up or inverted.
 
-    The body above the tandem follows from the mean of both axles; the second axle meets
-    the road after the first, and both after the body in front.
+    The body above the tandem follows from the mean of both axles; the second axle meets the road
+    after the first, and both after the body in front.
     """
     tandem = vehicle.tandem
     assert tandem is not None  # noqa: S101 - the caller saw to it

@@ -21,7 +21,7 @@ from pre_core.physics.sensors import (
     measure_position,
 )
 from pre_core.physics.vehicle import HalfCar
-from schemas.results import CrossingResult, ResultHeader
+from schemas.results import BridgeResult, CrossingResult, ResultHeader
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS, AccelChannel, decode_accel, encode_accel
 from schemas.site import Bridge, Site, Vehicle
@@ -110,9 +110,15 @@ def identified(case: Case, settings: IdentificationSettings | None = None) -> Cr
 
 def z_scores(case: Case, result: CrossingResult) -> Floats:
     """Error of every EI in its standard deviations."""
-    assert result.parameters is not None
-    found = [result.parameters[f"EI_{e + 1}"] for e in range(case.rigidity_nm2.size)]
-    return np.array([(p.mean - t) / p.std for p, t in zip(found, case.rigidity_nm2, strict=True)])
+    return errors_of(result, case.rigidity_nm2)
+
+
+def errors_of(result: CrossingResult | BridgeResult, truth_nm2: Floats) -> Floats:
+    """Error of every EI (n,) in its standard deviations."""
+    found = result.elements if isinstance(result, BridgeResult) else result.parameters
+    assert found, result.reasons
+    elements = [found[f"EI_{e + 1}"] for e in range(truth_nm2.size)]
+    return np.array([(p.mean - t) / p.std for p, t in zip(elements, truth_nm2, strict=True)])
 
 
 NOTHING = Fault()

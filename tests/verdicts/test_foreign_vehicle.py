@@ -21,6 +21,7 @@ from services.identification.bridge_state import (
     usable,
 )
 from services.simulation.drive import declared_site, paper_site, simulate_drive, write_drives
+from tests.verdicts.faults import errors_of
 
 NOISE_UG, RATE_HZ = 25.0, 500.0
 SEED = 5
@@ -131,11 +132,8 @@ def left_out(state: BridgeResult) -> dict[str, LeftOutReason]:
 
 def z_scores(found: BridgeResult | CrossingResult) -> NDArray[np.float64]:
     """Error of every EI in its standard deviations."""
-    outcome = found.elements if isinstance(found, BridgeResult) else found.parameters
-    assert outcome
-    truth = RATIOS * np.array(paper_site().bridges[0].nominal_flexural_rigidity_nm2)
-    elements = [outcome[f"EI_{e + 1}"] for e in range(RATIOS.size)]
-    return np.array([(one.mean - t) / one.std for one, t in zip(elements, truth, strict=True)])
+    nominal_nm2 = np.array(paper_site().bridges[0].nominal_flexural_rigidity_nm2)
+    return errors_of(found, RATIOS * nominal_nm2)
 
 
 def of_another_make(truck: Vehicle) -> Vehicle:

@@ -13,6 +13,7 @@ from services.drives.runs import normalised
 from services.simulation.drawn import identify_simulated
 from services.simulation.drive import declared_site, paper_site
 from tests.verdicts import opensees
+from tests.verdicts.faults import errors_of
 from tests.verdicts.opensees import Deck
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
@@ -47,10 +48,7 @@ def crossing(ops: Any, deck: Deck, folder: Path) -> CrossingResult:
 
 def errors(result: CrossingResult) -> np.ndarray:
     """Return the error of every element (n,) over its standard deviation."""
-    assert result.parameters is not None
-    found = [result.parameters[f"EI_{e + 1}"] for e in range(RATIOS.size)]
-    truth = RATIOS * NOMINAL_NM2
-    return np.array([(p.mean - t) / p.std for p, t in zip(found, truth, strict=True)])
+    return errors_of(result, RATIOS * NOMINAL_NM2)
 
 
 def test_beam_is_identified(ops: Any, tmp_path: Path) -> None:

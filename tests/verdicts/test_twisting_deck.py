@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Site
 from schemas.site_file import load_site
@@ -22,6 +21,7 @@ from services.simulation.drawn import default_site, drive, identify_simulated
 from services.simulation.drive import simulate_drive
 from services.simulation.out_of_model import draw_out_of_model
 from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
+from tests.verdicts.faults import errors_of
 
 LARGEST_Z, LARGEST_Z_OF_ENDS = 4.0, 3.0
 TORSION = ("lane_offset_m", "torsional_frequency_ratio", "deck_gyration_m")
@@ -34,20 +34,13 @@ def undeclared(site: Site) -> Site:
     return site.model_copy(update={"bridges": (Bridge.model_validate(keys),)})
 
 
-def errors(result: CrossingResult, truth: np.ndarray) -> np.ndarray:
-    """Return the error of every element (n,) over its standard deviation."""
-    assert result.parameters is not None, result.reasons
-    found = [result.parameters[f"EI_{e + 1}"] for e in range(truth.size)]
-    return np.array([(p.mean - t) / p.std for p, t in zip(found, truth, strict=True)])
-
-
 def test_truck_with_equal_tyres_is_found_before_its_mismatch() -> None:
     """A mismatch that was estimated before the truck led to a rear tyre a thousand times softer."""
     world = draw_out_of_model(default_site(), "torsion", 0)
     run = drive(world.site, world.truth, 0).run
     (found,) = identify_simulated([run], world.site, IdentificationSettings(threads=1))
     assert found.result.verdict == "good", found.result.reasons
-    z = errors(found.result, world.truth.beam.flexural_rigidity_nm2)
+    z = errors_of(found.result, world.truth.beam.flexural_rigidity_nm2)
     assert np.abs(z).max() < LARGEST_Z
 
 
@@ -64,7 +57,7 @@ def test_twisting_deck_is_answered_truly(shared: Path, is_declared: bool) -> Non
         one.result for one in identify_simulated(runs, site, IdentificationSettings(threads=1))
     ]
     assert [result.verdict for result in found] == ["good"] * 8
-    z = np.stack([errors(result, truth) for result in found])
+    z = np.stack([errors_of(result, truth) for result in found])
     assert np.abs(z).max() < LARGEST_Z
     assert np.abs(z[:, [0, -1]]).max() < LARGEST_Z_OF_ENDS
     for result in found:
@@ -99,4 +92,4 @@ def test_search_leaves_ends_that_are_held(shared: Path) -> None:
     (seen,) = identify_simulated([drive.run], declared, IdentificationSettings(threads=1))
     nominal = np.array(site.bridges[0].nominal_flexural_rigidity_nm2)
     assert seen.result.verdict == "good", seen.result.reasons
-    assert np.abs(errors(seen.result, truth * nominal)).max() < LARGEST_Z
+    assert np.abs(errors_of(seen.result, truth * nominal)).max() < LARGEST_Z

@@ -27,9 +27,13 @@ def recorded(seed: int) -> tuple[Vehicle, Floats, Motion]:
     case = draw_tandem(seed)
     found = drive_case(case, 0)
     signals = np.stack(list(found.run.channels.values()))
-    speed = np.full(signals.shape[1], case.runs[0].speed_m_per_s)
-    travelled = np.cumsum(speed) / case.rate_hz
-    return site_of(case).vehicles[0], signals, Motion(travelled, speed, np.zeros_like(speed))
+    motion = steady(signals.shape[1], case.runs[0].speed_m_per_s, case.rate_hz)
+    return site_of(case).vehicles[0], signals, motion
+
+
+def steady(count: int, speed_m_per_s: float, rate_hz: float) -> Motion:
+    speed = np.full(count, speed_m_per_s)
+    return Motion(np.cumsum(speed) / rate_hz, speed, np.zeros_like(speed))
 
 
 def judged(seed: int, change: Callable[[Floats], Floats]) -> dict[Reason, str]:
@@ -60,9 +64,7 @@ def test_body_that_pitches_is_judged_by_the_road(sign: float) -> None:
     run, _ = drawn_tandem(site, truth, seed, 13_000, world).recorded
     signals = np.stack(list(run.channels.values()))
     signals[0] *= sign
-    speed = np.full(signals.shape[1], truth.conditions.speed_m_per_s)
-    travelled = np.cumsum(speed) / run.rate_hz
-    motion = Motion(travelled, speed, np.zeros_like(speed))
+    motion = steady(signals.shape[1], truth.conditions.speed_m_per_s, run.rate_hz)
     vehicle = site.vehicles[0]
     found = dict(reasons_before_fit(vehicle, signals, 1.0 / run.rate_hz, motion, 1))
     expected = {} if sign > 0.0 else {Reason.CHANNEL_INVERTED: middle_names(vehicle)[0]}
