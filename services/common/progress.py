@@ -25,6 +25,10 @@ def no_progress(offset: int) -> None:
     """Ignore progress."""
 
 
+def no_part_progress(name: str, stage: str, share: float) -> None:
+    """Ignore progress of parts."""
+
+
 def no_step_progress(done: int, steps: int) -> None:
     """Ignore progress in steps."""
 

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 from schemas.results import BridgeResult, CrossingResult, ResultHeader, Results, results
 from schemas.settings import IdentificationSettings
 from services.common.errors import InputError
-from services.common.progress import Parts
+from services.common.progress import Parts, no_part_progress
 from services.identification.bridge_state import (
     Fusing,
     RecentCrossings,
@@ -109,6 +109,12 @@ def fuse_crossings(
     header = ResultHeader(program_version(), time.time(), last.site_hash, last.settings, last.seed)
     every = results(header, with_common_shares(list(found.crossings), states), states)
     return FusedResults(every, bridges, unfused, found.repeated)
+
+
+def fuse_bridge(name: str, crossings: Sequence[CrossingResult]) -> BridgeResult | None:
+    """Return the state of one bridge from all its crossings; None if none can be fused."""
+    fusing = Fusing(threads=IdentificationSettings().threads)
+    return _state(name, list(crossings), fusing, no_part_progress)
 
 
 def _state(

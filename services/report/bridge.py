@@ -12,6 +12,7 @@ import numpy as np
 from schemas.results import BridgeResult, CrossingResult, Results, load_results
 from schemas.site import Bridge, Site
 from services.common.errors import InputError
+from services.common.extras import check_extras
 from services.common.language import ENGLISH, Language
 from services.execution.blas import one_blas_thread
 from services.history.bridge_history import BridgeHistory, bridge_history
@@ -84,8 +85,9 @@ def bridge_reports(
 ) -> list[BridgeReport]:
     """Return one report for each bridge that was crossed, in the order of the site files.
 
-    Of a crossing in several files the newest result counts; of a bridge's states the one with the
-    newest crossing. `baseline` is a results file with which to compare; otherwise the one that the
+    Of a crossing in several files the newest result counts. The numbers of a bridge are those of
+    the state with the newest crossing; if other files have good crossings of its realm that are not
+    in it, all are fused. `baseline` is a results file with which to compare; otherwise the one that the
     site file names, whose folder is `beside` (default: that of the results). Raise InputError if a
     baseline does not fit, or results do not fit their site file.
     """
@@ -146,8 +148,10 @@ def _report(
     for _, results, _ in about:
         newest.update((c.crossing_id, c) for c in results.crossings if c.bridge == name)
     path, last, site = about[-1]
-    state = _latest_state(name, [results for _, results, _ in about], newest)
     crossings = tuple(sorted(newest.values(), key=lambda crossing: crossing.entry_time))
+    state = _latest_state(name, [results for _, results, _ in about], newest)
+    if len(about) > 1:
+        state = _state_of_all(name, state, crossings)
     bridges = {} if state is None else {name: state}
     merged = last.model_copy(update={"crossings": crossings, "bridges": bridges})
     bridge = site.bridge(name)
@@ -177,6 +181,26 @@ def _latest_state(
 
     states = [results.bridges[name] for results in files if name in results.bridges]
     return max(states, key=moment) if states else None
+
+
+def _state_of_all(
+    name: str, state: BridgeResult | None, crossings: Sequence[CrossingResult]
+) -> BridgeResult | None:
+    """Return a state of all good crossings of the newest one's realm, fused anew if one lacks."""
+    realm = crossings[-1].realm
+    good = [c for c in crossings if c.realm == realm and c.verdict == "good"]
+    fusable = {c.crossing_id for c in good if c.fusion_likelihood is not None}
+    known = set[str]()
+    if state is not None:
+        known = {*state.crossings_used, *(one.crossing_id for one in state.crossings_left_out)}
+    if fusable <= known:
+        return state
+    check_extras("a report of several results files", ("identify",))
+    # Kernels are slow to import, and most reports are of one file.
+    from services.execution.fuse_results import fuse_bridge
+
+    with one_blas_thread():
+        return fuse_bridge(name, [c for c in crossings if c.realm == realm])
 
 
 def _before(
@@ -315,6 +339,11 @@ def _quality(view: BridgeView, crossings: Sequence[CrossingResult], language: La
         f"{counts[v]} {language.text(v)}" for v in ("good", "suspect", "rejected") if counts[v]
     )
     parts = [language.choice("quality.count", len(crossings), verdicts=verdicts)]
+    others = sorted({one.realm for one in crossings} - {crossings[-1].realm})
+    if others:
+        number = sum(one.realm in others for one in crossings)
+        realms = ", ".join(others)
+        parts.append(language.choice("quality.other_realm", number, realms=realms))
     if view.estimate is None:
         return " ".join((*parts, language.text("quality.none")))
     if view.state is not None and len(view.used) > 1:

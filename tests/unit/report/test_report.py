@@ -16,6 +16,7 @@ from schemas.site_file import load_site, site_toml
 from services.cli.identify import _fit_lines
 from services.common.errors import FailureError
 from services.common.language import ENGLISH, language_of
+from services.execution.fuse_results import fuse_bridge
 from services.planning.plan_survey import SurveyWishes
 from services.report import pdf
 from services.report.advice import next_steps
@@ -24,6 +25,7 @@ from services.report.html import Html, inlined_svg, joined, tag
 from services.report.page import page
 from services.report.place import ends_of, start_of
 from tests.builders.commands import run
+from tests.fleet import losses_of
 from tests.unit.viewer.found import RATIOS, results_of, some_crossing
 
 
@@ -250,6 +252,26 @@ def test_several_files_are_one_report_and_the_newest_result_of_a_crossing_counts
         text = reported(site, *order).text
         assert "2 crossings: 1 good, 1 rejected." in text
         assert "Element 4" in text  # the state of the older file
+
+
+def test_several_surveys_are_fused_and_other_campaigns_are_named(site: Site) -> None:
+    drives = losses_of({"bridge-1": None}, 1.79e9, 3)
+    surveys = [drives.crossings[:3], drives.crossings[3:]]
+    files = []
+    for number, survey in enumerate(surveys):
+        state = fuse_bridge("bridge-1", survey)
+        assert state is not None and len(state.crossings_used) == 3
+        header = {"created": drives.created + number, "bridges": {"bridge-1": state}}
+        files.append(drives.model_copy(update={"crossings": survey, **header}))
+    together = fuse_bridge("bridge-1", drives.crossings)
+    assert together is not None
+    text = reported(site, *files).text
+    assert "6 crossings: 6 good. The numbers below combine all 6;" in text
+    assert f" {together.elements['EI_1'].mean / 1e9:.2f} " in text
+    other = tuple(one.model_copy(update={"realm": "sim-other"}) for one in surveys[0])
+    text = reported(site, files[0].model_copy(update={"crossings": other}), files[1]).text
+    assert "3 of them are of another campaign (realm sim-other) and not in the numbers" in text
+    assert "The numbers below combine 3 of them;" in text
 
 
 @pytest.mark.parametrize(
