@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from schemas.alarms import Alarm
+from services.common.language import ENGLISH, Language
 from services.history.alarm_files import alarms_of
 from services.history.history_store import (
     HistoryRow,
@@ -109,44 +110,35 @@ def bridge_history(
     return BridgeHistory(bridge, realm, unit, tuple(periods), tuple(alarms), watch, comparison)
 
 
-def statements(past: BridgeHistory) -> Iterator[Statement]:
+def statements(past: BridgeHistory, language: Language = ENGLISH) -> Iterator[Statement]:
     """Yield the sentences for a bridge without a standing alarm."""
     watch = past.watch
     if any(alarm.acknowledged is None for alarm in past.alarms):
         return
-    yield Statement(watch.sentence, watch.found_nothing)
+    yield Statement(watch.words(language), watch.found_nothing)
     if watch.found_nothing:
         return
     if past.comparison is None:
-        yield Statement(
-            f"A change cannot be seen yet: fewer than two {past.unit}s have good crossings that "
-            "can be compared.",
-            is_reassuring=False,
-        )
+        units = language.text(f"{past.unit}s")
+        yield Statement(language.text("change.unseen", units=units), is_reassuring=False)
         return
-    yield Statement(_comparison_sentence(past.comparison, past.unit), is_reassuring=False)
+    sentence = _comparison_sentence(past.comparison, past.unit, language)
+    yield Statement(sentence, is_reassuring=False)
 
 
-def _comparison_sentence(found: PeriodComparison, unit: Unit) -> str:
-    first, last = period_name(found.first_s, unit), period_name(found.last_s, unit)
+def _comparison_sentence(found: PeriodComparison, unit: Unit, language: Language) -> str:
+    times = {"first": period_name(found.first_s, unit), "last": period_name(found.last_s, unit)}
     size = sorted(found.changes, key=_deviations, reverse=True)
     clear = [one for one in size if one.is_clear]
-    rest = "These values are not corrected for temperature or season."
     if not clear:
-        most = size[0]
-        return (
-            f"From {first} to {last} no element changed by more than its 95 % interval; the "
-            f"largest change is that of element {most.element}, {_percent(most.ratio)} "
-            f"({_percent(most.low)} to {_percent(most.high)}). {rest}"
-        )
+        return language.text("change.none", **times, **_in_per_cent(size[0], language))
     changed = ", ".join(
-        f"element {one.element} {_percent(one.ratio)} (95 % interval {_percent(one.low)} to "
-        f"{_percent(one.high)})"
+        language.text("change.element", **_in_per_cent(one, language))
         for one in clear[:_MAX_ELEMENTS]
     )
     more = len(clear) - _MAX_ELEMENTS
-    others = f" and {more} more" if more > 0 else ""
-    return f"EI from {first} to {last}: {changed}{others}. {rest}"
+    others = language.text("change.more", number=more) if more > 0 else ""
+    return language.text("change.clear", **times, changed=changed + others)
 
 
 _MAX_ELEMENTS = 3
@@ -157,8 +149,12 @@ def _deviations(one: ElementChange) -> float:
     return float(abs(np.log(one.ratio)) / np.log(one.high / one.low))
 
 
-def _percent(ratio: float) -> str:
-    return f"{100.0 * (ratio - 1.0):+.0f} %".replace("-", "−")
+def _in_per_cent(one: ElementChange, language: Language) -> dict[str, str | int]:
+    change = {
+        name: f"{language.number(100.0 * (ratio - 1.0), '+.0f')} %"
+        for name, ratio in (("change", one.ratio), ("low", one.low), ("high", one.high))
+    }
+    return {"element": one.element, **change}
 
 
 def _compare_periods(crossings: Iterable[HistoryRow], unit: Unit) -> PeriodComparison | None:

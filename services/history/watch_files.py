@@ -15,6 +15,7 @@ from schemas.alarms import Alarm
 from schemas.json_file import load_json
 from services.common.errors import InputError
 from services.common.files import make_folder, write_atomically
+from services.common.language import ENGLISH, Language
 from services.history.alarm_files import ALARMS
 from services.history.history_store import HistoryRow
 from services.history.periods import Unit, begin_of
@@ -67,7 +68,35 @@ class MonitoringState(NamedTuple):
 
     state: State
     record: WatchRecord | None
-    sentence: str
+    is_damaged: bool = False
+    """Whether the record exists but is unreadable."""
+
+    @property
+    def sentence(self) -> str:
+        """The state in words, in English."""
+        return self.words(ENGLISH)
+
+    def words(self, language: Language) -> str:
+        """Return the state in words; the problem of a failed check stays in English."""
+        record = self.record
+        if record is None:
+            return language.text(f"watch.{'damaged' if self.is_damaged else 'never_checked'}")
+        judged = "many" if record.judged != 1 else "one"
+        return language.text(
+            f"watch.{self.state}" + (f".{judged}" if self.state == "watched" else ""),
+            unit=language.text(record.period),
+            units=language.text(f"{record.period}s"),
+            checked=day_of(record.checked),
+            problem=record.problem,
+            periods=record.periods,
+            training=record.training,
+            until=day_of(record.until),
+            year_ends=day_of(record.year_ends),
+            judged=record.judged,
+            first=day_of(record.judged_from),
+            last=day_of(record.judged_to),
+            change=language.number(100.0 * record.at_least, "g"),
+        )
 
     @property
     def found_nothing(self) -> bool:
@@ -111,18 +140,11 @@ def monitoring_state(
     try:
         record = record_of(folder, realm, bridge)
     except InputError as error:
-        return _never("its record of the last check is damaged; run driveby alarm check"), [
-            str(error)
-        ]
+        return MonitoringState("never_checked", None, is_damaged=True), [str(error)]
     if record is None:
-        return _never("driveby alarm check has not been run on this bridge"), []
+        return MonitoringState("never_checked", None), []
     entries_s = None if crossings is None else [one.entry_s for one in crossings]
-    state = _state(record, entries_s, tuple(alarms), now_s)
-    return MonitoringState(state, record, _sentence(state, record)), []
-
-
-def _never(why: str) -> MonitoringState:
-    return MonitoringState("never_checked", None, f"Not watched: {why}.")
+    return MonitoringState(_state(record, entries_s, tuple(alarms), now_s), record), []
 
 
 def _state(
@@ -146,44 +168,6 @@ def _state(
         return "season" if record.year_ends is not None else "training"
     noted_s = max((a.acknowledged.time for a in alarms if a.acknowledged is not None), default=0.0)
     return "acknowledged" if record.judged_to <= noted_s else "watched"
-
-
-def _sentence(state: State, record: WatchRecord) -> str:
-    unit = record.period
-    match state:
-        case "alarm":
-            return "An alarm is active: nothing else is judged until it is acknowledged."
-        case "out_of_date":
-            return (
-                f"Not watched since {day_of(record.checked)}: crossings were added after "
-                "driveby alarm check was run."
-            )
-        case "failed":
-            return f"Not watched: {record.problem}."
-        case "no_crossings":
-            return f"Not watched: no {unit} has good crossings that can be compared."
-        case "training":
-            return (
-                f"Not watched yet: {record.periods} of {record.training} training {unit}s, "
-                f"up to {day_of(record.until)}."
-            )
-        case "season":
-            return (
-                "Not watched yet: temperatures are unknown, so the season is learned for a year, "
-                f"until {day_of(record.year_ends)}."
-            )
-        case "acknowledged":
-            return f"No {unit} has been judged since the last alarm was acknowledged."
-        case _:
-            return (
-                f"No alarm: {record.judged} {_of(unit, record.judged)} judged, "
-                f"{day_of(record.judged_from)} to {day_of(record.judged_to)}; none shows a change "
-                f"that is clearly larger than {100.0 * record.at_least:g} %."
-            )
-
-
-def _of(unit: Unit, number: int) -> str:
-    return unit if number == 1 else f"{unit}s"
 
 
 def day_of(time_s: float | None) -> str:

@@ -25,15 +25,12 @@ def history_summary(past: BridgeHistory, language: Language = ENGLISH) -> str:
 
 
 def history_section(past: BridgeHistory, prefix: str, language: Language = ENGLISH) -> Html:
-    """Return the section; empty for a history without values.
-
-    Its figure and the sentences on monitoring are English.
-    """
+    """Return the section; empty for a history without values."""
     drawn = history_view(past)
     if not drawn.points:
         return Html("")
     with matplotlib.rc_context(STYLE):
-        svg = figure_bytes(draw_history(drawn), "svg")
+        svg = figure_bytes(draw_history(drawn, with_heading=False, language=language), "svg")
     wording = language.text(
         "history.from_to",
         how_much=_how_much(past, language),
@@ -76,7 +73,7 @@ def _alarms(past: BridgeHistory, language: Language) -> Iterator[Html]:
         lines.append(tag("li", line))
     if lines:
         yield tag("ul", *lines)
-    for wording in statements(past):
+    for wording in statements(past, language):
         yield tag(
             "p", wording.text, class_="reassuring" if wording.is_reassuring else "not-watched"
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Iterable
 from datetime import UTC, datetime
@@ -16,6 +17,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from services.common.language import ENGLISH, Language
 from services.history.bridge_history import BridgeHistory, Statement, statements
 from services.viewer.crossing_view import VERDICT_COLOURS
 from services.viewer.drawing import (
@@ -121,24 +123,29 @@ def history_view(past: BridgeHistory) -> HistoryView:
     return HistoryView(past.bridge, past.unit, tuple(points), marks, tuple(statements(past)))
 
 
-def draw_history(history: HistoryView) -> Figure:
+def draw_history(
+    history: HistoryView, *, with_heading: bool = True, language: Language = ENGLISH
+) -> Figure:
     """Return the figure, to be drawn in `STYLE`: a panel per element, with one scale.
 
-    Values are per cent of each element's own median, so that elements can be compared.
+    Values are per cent of each element's own median, so that elements can be compared. The
+    sentences of alarms and of monitoring in the heading are those of the view.
     """
     elements = max((len(point.mean) for point in history.points), default=0)
     has_temperature = any(p.temperature_deg_c is not None for p in history.points)
-    lines = _heading(history)
-    heading = 0.62 + 0.2 * len(lines)
+    lines = _heading(history, language) if with_heading else []
+    heading = 0.62 + 0.2 * len(lines) if with_heading else 0.12
     bottom = 0.45
     below = _TEMPERATURE_IN + 0.12 if has_temperature else 0.0
     height = heading + _PANEL_IN * elements + below + bottom
     figure = Figure(figsize=(WIDTH_IN, height))
     FigureCanvasAgg(figure)
-    figure.text(
-        LEFT, 1.0 - 0.28 / height, f"{history.bridge}: rigidity over time", va="top",
-        fontsize=13, fontweight="bold", color=INK, parse_math=False,
-    )  # fmt: skip
+    if with_heading:
+        figure.text(
+            LEFT, 1.0 - 0.28 / height,
+            language.text("history.figure_title", bridge=history.bridge), va="top",
+            fontsize=13, fontweight="bold", color=INK, parse_math=False,
+        )  # fmt: skip
     for number, (text, colour) in enumerate(lines):
         top = 1.0 - (0.58 + 0.2 * number) / height
         figure.text(LEFT, top, text, va="top", fontsize=9.5, color=colour, parse_math=False)
@@ -148,7 +155,7 @@ def draw_history(history: HistoryView) -> Figure:
         at = 1.0 - (heading + _PANEL_IN * (n + 1)) / height
         axes = figure.add_axes((LEFT, at, RIGHT - LEFT, (_PANEL_IN - 0.12) / height), sharex=first)
         first = first or axes
-        _draw_element(axes, history, n, limits)
+        _draw_element(axes, history, n, limits, language)
         axes.tick_params(labelbottom=n == elements - 1 and not has_temperature)
     if first is not None:
         days = _dates(point.time_s for point in history.points)
@@ -157,26 +164,26 @@ def draw_history(history: HistoryView) -> Figure:
         first.set_xlim(min(days) - margin, max(days) + margin)
     if has_temperature and first is not None:
         size = (LEFT, bottom / height, RIGHT - LEFT, (_TEMPERATURE_IN - 0.1) / height)
-        _draw_temperature(figure.add_axes(size, sharex=first), history)
+        _draw_temperature(figure.add_axes(size, sharex=first), history, language)
     return figure
 
 
-def _heading(history: HistoryView) -> list[tuple[str, str]]:
+def _heading(history: HistoryView, language: Language) -> list[tuple[str, str]]:
     many = len(history.points)
-    wording = (
-        f"{many} {history.unit}{'s' if many != 1 else ''} with crossings; bars: 95 % intervals"
-    )
-    lines = [(wording + ", grey where no crossing was good", MUTED)]
+    unit = language.text(history.unit if many == 1 else f"{history.unit}s")
+    lines = [(language.choice("history.figure_bars", many, unit=unit), MUTED)]
     for mark in history.marks:
         if not mark.acknowledged:
-            lines.append((f"ALARM: {mark.sentence}", _colour(mark)))
+            wording = language.text("history.figure_alarm", alarm=mark.sentence)
+            lines.append((wording, _colour(mark)))
             continue
-        lines.append((f"noted: {mark.sentence} ({_short(mark.acknowledged)})", INK))
+        by = _short(mark.acknowledged)
+        lines.append((language.text("history.figure_noted", alarm=mark.sentence, by=by), INK))
         if mark.note:
             lines.append((f"“{_short(mark.note)}”", MUTED))
     if any(not mark.acknowledged for mark in history.marks):
-        how = f"driveby alarm ack {history.bridge} --by NAME --note TEXT"
-        lines.append((f"Inspect the bridge, then acknowledge the alarm: {how}", MUTED))
+        command = f"driveby alarm ack {history.bridge} --by NAME --note TEXT"
+        lines.append((language.text("history.figure_ack", command=command), MUTED))
     for one in history.statements:
         colour = VERDICT_COLOURS["good"] if one.is_reassuring else INK
         lines += [(line, colour) for line in textwrap.wrap(one.text, _LINE_CHARACTERS)]
@@ -210,7 +217,9 @@ def _usual(history: HistoryView, n: int) -> float:
     return float(np.median([p.mean[n] for p in history.points if len(p.mean) > n]))
 
 
-def _draw_element(axes: Axes, history: HistoryView, n: int, limits: tuple[float, float]) -> None:
+def _draw_element(
+    axes: Axes, history: HistoryView, n: int, limits: tuple[float, float], language: Language
+) -> None:
     usual = _usual(history, n)
     axes.axhline(100.0, color=MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
     for is_good in (True, False):
@@ -231,9 +240,12 @@ def _draw_element(axes: Axes, history: HistoryView, n: int, limits: tuple[float,
             since, raised = _dates([mark.since_s, mark.raised_s])
             axes.axvspan(since, raised, color=colour, alpha=0.13, linewidth=0.0)
             axes.axvline(raised, color=colour, linewidth=1.6)
-            wording = "stiffer" if mark.is_stiffer else "less stiff"
+            which = "stiffer" if mark.is_stiffer else "weaker"
+            wording = language.text(f"history.mark.{which}")
+            if mark.acknowledged:
+                wording = language.text("history.mark_noted", mark=wording)
             axes.annotate(
-                f"{wording}, noted" if mark.acknowledged else wording, (raised, limits[1]),
+                wording, (raised, limits[1]),
                 xytext=(4, -3), textcoords="offset points", va="top", fontsize=8.5,
                 color=colour, fontweight="bold",
             )  # fmt: skip
@@ -246,13 +258,13 @@ def _draw_element(axes: Axes, history: HistoryView, n: int, limits: tuple[float,
     axes.set_axisbelow(True)
     # Outside the panel, as points may be anywhere within it.
     axes.annotate(
-        f"100 %:\n{usual / 1e9:#.3g} GN·m²", (0.0, 0.5), xycoords="axes fraction", xytext=(-6, -8),
+        f"100 %:\n{language.number(usual / 1e9, '#.3g')} GN·m²", (0.0, 0.5), xycoords="axes fraction", xytext=(-6, -8),
         textcoords="offset points", ha="right", va="top", fontsize=7, color=MUTED,
     )  # fmt: skip
-    _over_time(axes)
+    _over_time(axes, language)
 
 
-def _draw_temperature(axes: Axes, history: HistoryView) -> None:
+def _draw_temperature(axes: Axes, history: HistoryView, language: Language) -> None:
     known = [p for p in history.points if p.temperature_deg_c is not None]
     axes.plot(
         _dates(p.time_s for p in known), [p.temperature_deg_c or 0.0 for p in known],
@@ -261,14 +273,35 @@ def _draw_temperature(axes: Axes, history: HistoryView) -> None:
     axes.set_ylabel("°C", rotation=0, ha="right", va="center", labelpad=6)
     axes.yaxis.tick_right()
     axes.grid(color=GRID, linewidth=0.8)
-    _over_time(axes)
+    _over_time(axes, language)
 
 
-def _over_time(axes: Axes) -> None:
+class _LocalisedDates(ConciseDateFormatter):
+    """Dates with the month names of a language, whatever the locale of the process."""
+
+    def __init__(self, locator: Any, language: Language) -> None:
+        super().__init__(locator, tz=UTC)  # type: ignore[no-untyped-call]
+        english, own = (one.text("history.month_names").split(",") for one in (ENGLISH, language))
+        self._names = dict(zip(english, own, strict=True))
+
+    def format_ticks(self, values: Any) -> list[str]:
+        """Return the labels of ticks."""
+        labels: list[str] = super().format_ticks(values)  # type: ignore[no-untyped-call]
+        return [re.sub("[A-Z][a-z]{2}", self._localised, label) for label in labels]
+
+    def get_offset(self) -> str:
+        """Return the part of the date that all ticks share."""
+        shared: str = super().get_offset()  # type: ignore[no-untyped-call]
+        return re.sub("[A-Z][a-z]{2}", self._localised, shared)
+
+    def _localised(self, found: re.Match[str]) -> str:
+        return self._names.get(found[0], found[0])
+
+
+def _over_time(axes: Axes, language: Language) -> None:
     locator: Any = AutoDateLocator(tz=UTC)  # type: ignore[no-untyped-call]
     axes.xaxis.set_major_locator(locator)
-    form: Any = ConciseDateFormatter(locator, tz=UTC)  # type: ignore[no-untyped-call]
-    axes.xaxis.set_major_formatter(form)
+    axes.xaxis.set_major_formatter(_LocalisedDates(locator, language))
     for side in ("top", "left", "right"):
         axes.spines[side].set_visible(False)
 

@@ -157,11 +157,11 @@ def _print_watches(folder: Path) -> None:
     if not found:
         return
     others = {name: one for name, one in found.items() if one.state not in ("watched", "alarm")}
-    print(f"{len(found) - len(others)} of {len(found)} bridges watched")
+    print(f"{len(found) - len(others)} of {len(found)} bridges monitored")
     for realm, bridge in list(others)[:_MAX_LINES]:
         print(f"{bridge} in realm {realm}: {others[(realm, bridge)].sentence}")
     if len(others) > _MAX_LINES:
-        print(f"and {len(others) - _MAX_LINES} more that are not watched")
+        print(f"and {len(others) - _MAX_LINES} more that are not monitored")
 
 
 def _acknowledge(options: AlarmOptions, bridge: str) -> int:

@@ -102,7 +102,7 @@ def test_only_a_watch_that_judged_says_that_nothing_has_changed(history: Path) -
     check(history, AlarmSettings(learning=40), AFTER_S)
     training = watch_now(history)
     assert (training.state, training.found_nothing) == ("training", False)
-    assert training.sentence == ("Not watched yet: 24 of 40 training weeks, up to 2025-06-23.")
+    assert training.sentence == ("Not monitored yet: 24 of 40 training weeks, up to 2025-06-23.")
     check(history, AlarmSettings(), AFTER_S)
     assert watch_now(history).found_nothing
     assert watch_now(history).sentence == (
@@ -137,7 +137,7 @@ def test_crossings_that_came_after_the_check_are_not_vouched_for(tmp_path: Path)
     later = watch_now(tmp_path)
     assert (later.state, later.sentence) == (
         "out_of_date",
-        "Not watched since 2025-06-09: crossings were added after driveby alarm check was run.",
+        "Not monitored since 2025-06-09: crossings were added after driveby alarm check was run.",
     )
     check(tmp_path, AlarmSettings(), AFTER_S)
     assert watch_now(tmp_path).found_nothing
@@ -175,7 +175,7 @@ def test_a_year_passes_before_an_unknown_season_is_judged(tmp_path: Path) -> Non
     assert (found.state, found.sentence) == (
         "season",
         (
-            "Not watched yet: temperatures are unknown, so the season is learned for a year, until "
+            "Not monitored yet: temperatures are unknown, so the season is learned for a year, until "
             "2026-01-05."
         ),
     )
@@ -273,9 +273,9 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     never = "driveby alarm check has not been run on this bridge."
     assert capsys.readouterr().out.splitlines() == [
         "no alarms",
-        "0 of 2 bridges watched",
-        f"bridge-1 in realm sim-fleet: Not watched: {never}",
-        f"bridge-2 in realm sim-fleet: Not watched: {never}",
+        "0 of 2 bridges monitored",
+        f"bridge-1 in realm sim-fleet: Not monitored: {never}",
+        f"bridge-2 in realm sim-fleet: Not monitored: {never}",
     ]
     assert cli.main(["alarm", "check", *there]) == 0
     said = capsys.readouterr().out
@@ -283,7 +283,7 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     assert "-4-weaker of bridge-2, raised 2025-" in said
     how = "then acknowledge the alarm: driveby alarm ack BRIDGE --by NAME --note TEXT\n"
     assert said.endswith(how)
-    assert "\n2 of 2 bridges watched\n" in said
+    assert "\n2 of 2 bridges monitored\n" in said
     assert cli.main(["alarm", "list", *there]) == 0
     assert capsys.readouterr().out.endswith(how)
     assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", "--note", "props", *there]) == 0

@@ -104,7 +104,7 @@ def test_report_page_shows_months_elements_and_alarms(past: BridgeHistory) -> No
     assert "The bridge over time" in found.text
     assert "34 crossings in 2 months, 2026-03-01 to 2026-05-01." in found.text
     assert "No alarm" not in found.text
-    never = "Not watched: driveby alarm check has not been run on this bridge."
+    never = "Not monitored: driveby alarm check has not been run on this bridge."
     assert never in found.text
     assert "From 2026-03 to 2026-04 no element changed by more than its 95 % interval" in found.text
     assert "Median of all months (GN·m²) Newest month (GN·m²)" in found.text
@@ -188,7 +188,7 @@ def test_one_month_is_nothing_to_compare_with(
     add_results(tmp_path, crossings(5))
     assert cli.main(["history", "bridge-1", "--history", str(tmp_path)]) == 0
     assert capsys.readouterr().out.splitlines()[-2:] == [
-        "Not watched: driveby alarm check has not been run on this bridge.",
+        "Not monitored: driveby alarm check has not been run on this bridge.",
         (
             "A change cannot be seen yet: fewer than two months have good crossings that can be "
             "compared."

@@ -10,11 +10,15 @@ from schemas.reasons import LEFT_OUT_TEXTS, REASON_TEXTS, BridgeReason, Reason
 from schemas.results import results_json
 from schemas.site import Site
 from services.common.language import ENGLISH, LANGUAGES, Language, language_of
+from services.history.bridge_history import bridge_history
+from services.history.history_store import add_results
 from services.report.bridge import bridge_reports
-from services.report.history_section import alarm_sentence
+from services.report.history_section import alarm_sentence, history_section
 from services.report.page import page
+from services.viewer.history_figure import draw_history, history_view
 from tests.unit.history.test_bridge_history import alarm
-from tests.unit.report.test_report import KNOWN, fused, reported, site
+from tests.unit.history.test_history_store import crossings
+from tests.unit.report.test_report import KNOWN, Seen, fused, reported, site
 from tests.unit.viewer.found import RATIOS, results_of, some_crossing
 
 __all__ = ["site"]
@@ -102,6 +106,21 @@ def test_a_german_report_has_no_english_sentence(site: Site, tmp_path: Path) -> 
     assert "Ein Element ist deutlich weniger steif." in texts[1]
     assert "Element 4, 12,9 bis 17,1 m: 60 % weniger steif als die anderen" in texts[1]
     assert "Noch kein verlässliches Ergebnis." not in texts[1]
+
+
+def test_history_of_a_german_report_is_german(tmp_path: Path) -> None:
+    add_results(tmp_path, crossings(34))
+    past = bridge_history(tmp_path, "sim-fleet", "bridge-1", "month", print)
+    text = Seen(history_section(past, "h-", GERMAN)).text
+    assert "Nicht überwacht: driveby alarm check wurde" in text
+    assert " 2026-03 bis 2026-04 " in text
+    for english in ("monitored", "crossings", " to ", "over time"):
+        assert english not in text
+    noted = history_view(past._replace(alarms=(alarm(),)))
+    axes = draw_history(noted, language=GERMAN).axes
+    axes[-1].figure.canvas.draw()
+    assert "März" in " ".join(label.get_text() for label in axes[-1].get_xticklabels())
+    assert [text.get_text() for text in axes[3].texts][0] == "weniger steif"
 
 
 def test_the_page_names_its_language(site: Site) -> None:

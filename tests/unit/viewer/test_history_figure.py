@@ -64,7 +64,7 @@ def test_the_head_says_what_to_do_while_an_alarm_stands() -> None:
     said = [
         text.get_text() for text in drawn(HistoryView("b-1", "week", points, (noted,), ())).texts
     ]
-    assert "noted: element 2 is weaker (the owner, 2025-06-23)" in said
+    assert "acknowledged: element 2 is weaker (the owner, 2025-06-23)" in said
     assert "“props were put in”" in said
     assert not any("driveby" in text for text in said)
     long = mark("the owner, 2025-06-23", "x" * 500)
