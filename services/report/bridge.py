@@ -87,9 +87,9 @@ def bridge_reports(
 
     Of a crossing in several files the newest result counts. The numbers of a bridge are those of
     the state with the newest crossing; if other files have good crossings of its realm that are not
-    in it, all are fused. `baseline` is a results file with which to compare; otherwise the one that the
-    site file names, whose folder is `beside` (default: that of the results). Raise InputError if a
-    baseline does not fit, or results do not fit their site file.
+    in it, all are fused. `baseline` is a results file with which to compare; otherwise the one that
+    the site file names, whose folder is `beside` (default: that of the results). Raise InputError
+    if a baseline does not fit, or results do not fit their site file.
     """
     for path, results, site in files:
         _check(path, results, site)
@@ -339,10 +339,10 @@ def _quality(view: BridgeView, crossings: Sequence[CrossingResult], language: La
         f"{counts[v]} {language.text(v)}" for v in ("good", "suspect", "rejected") if counts[v]
     )
     parts = [language.choice("quality.count", len(crossings), verdicts=verdicts)]
-    others = sorted({one.realm for one in crossings} - {crossings[-1].realm})
-    if others:
-        number = sum(one.realm in others for one in crossings)
-        realms = ", ".join(others)
+    campaigns = sorted({one.realm for one in crossings} - {crossings[-1].realm})
+    if campaigns:
+        number = sum(one.realm in campaigns for one in crossings)
+        realms = ", ".join(campaigns)
         parts.append(language.choice("quality.other_realm", number, realms=realms))
     if view.estimate is None:
         return " ".join((*parts, language.text("quality.none")))

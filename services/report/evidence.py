@@ -11,7 +11,7 @@ import matplotlib
 from schemas.results import CrossingResult, is_torsion_declared
 from services.common.language import Language
 from services.report.bridge import BridgeReport, reasons_of
-from services.report.html import Html, inlined_svg, table, tag
+from services.report.html import Html, inlined_svg, joined, table, tag
 from services.report.measurement import sensor_lines, truck_line, vehicles_of
 from services.report.place import ends_of
 from services.viewer.crossing_view import view_of_crossing
@@ -22,6 +22,7 @@ MAX_PICTURES = 12
 """Maximum number of crossings of a bridge in the figure, the newest ones."""
 _COLUMNS = 6
 """Maximum number of crossings next to each other in a table of measures."""
+_COLUMNS_WITH_MEANINGS = 3
 _DIAGNOSTICS = ("r_hat", "ess", "position_shift_m", "line_hz")
 
 Numbered = tuple[int, CrossingResult]
@@ -92,10 +93,19 @@ def _what_measured(report: BridgeReport, language: Language) -> Html:
     rows = [
         (language.text("fact.truck"), trucks),
         (language.text("fact.sensors"), sensors),
+        (language.text("fact.road"), _newest_road(report.crossings, language)),
         (language.text("fact.source"), f"{files}; {programs}"),
         (language.text("fact.computed"), f"{moment(report.computed_s)} UTC"),
     ]
     return facts([row for row in rows if row[1]])
+
+
+def _newest_road(crossings: Sequence[CrossingResult], language: Language) -> str:
+    for crossing in reversed(crossings):
+        road = road_of(crossing, language)
+        if road is not None:
+            return language.text("road.newest", road=road)
+    return language.text("road.unknown")
 
 
 def _crossings(report: BridgeReport, numbered: Sequence[Numbered], language: Language) -> Html:
@@ -151,19 +161,27 @@ def _measures(numbered: Sequence[Numbered], language: Language) -> Iterator[Html
     if columns:
         yield tag("h3", language.text("heading.measures"))
     for first in range(0, len(columns), _COLUMNS):
-        some = columns[first : first + _COLUMNS]
-        names = dict.fromkeys(name for _, measures in some for name in measures)
-        rows = []
-        for name in names:
-            known = [measures.get(name) for _, measures in some]
-            meaning = next(one.meaning for one in known if one is not None)
-            cells = ["" if one is None else one.value for one in known]
-            rows.append(
-                [language.text(f"measure.{name}"), *cells, language.text(f"meaning.{meaning}")]
-            )
-        numbers = [f"{language.text('crossings.number')} {number}" for number, _ in some]
-        heads = [language.text("measures.name"), *numbers, language.text("measures.meaning")]
-        yield tag("div", table(heads, rows), class_="measures")
+        yield _measures_table(columns[first : first + _COLUMNS], language)
+
+
+def _measures_table(columns: Sequence[tuple[int, dict[str, Measure]]], language: Language) -> Html:
+    """Return a table of measures; their meanings have a column unless it would be too narrow."""
+    has_meanings = len(columns) <= _COLUMNS_WITH_MEANINGS
+    rows = []
+    for name in dict.fromkeys(name for _, measures in columns for name in measures):
+        known = [measures.get(name) for _, measures in columns]
+        key = next(one.meaning for one in known if one is not None)
+        label, meaning = language.text(f"measure.{name}"), language.text(f"meaning.{key}")
+        cells = ["" if one is None else one.value for one in known]
+        if has_meanings:
+            rows.append([label, *cells, meaning])
+        else:
+            rows.append([joined(label, tag("small", f" {meaning}")), *cells])
+    numbers = [f"{language.text('crossings.number')} {number}" for number, _ in columns]
+    heads = [language.text("measures.name"), *numbers]
+    if has_meanings:
+        heads.append(language.text("measures.meaning"))
+    return tag("div", table(heads, rows), class_="measures" if has_meanings else "many measures")
 
 
 def measures_of(crossing: CrossingResult, language: Language) -> Iterator[Measure]:
@@ -200,7 +218,10 @@ def measures_of(crossing: CrossingResult, language: Language) -> Iterator[Measur
         yield Measure("class", "class", road.iso_class)
     for key in _DIAGNOSTICS:
         if key in crossing.diagnostics:
-            yield Measure(key, key, _plain(crossing.diagnostics[key], language))
+            value = crossing.diagnostics[key]
+            # The limit is 1.05: a plain 1 would hide how near a value is to it.
+            text = language.number(value, ".3f") if key == "r_hat" else _plain(value, language)
+            yield Measure(key, key, text)
 
 
 def _plain(value: float, language: Language) -> str:

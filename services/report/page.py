@@ -13,7 +13,7 @@ from services.common.progress import Steps, no_step_progress
 from services.identification.comparison import Comparison, Element, per_cent_up
 from services.report.advice import next_steps
 from services.report.bridge import BridgeReport, reasons_of
-from services.report.evidence import evidence, facts, pictured, road_of
+from services.report.evidence import evidence, facts, pictured
 from services.report.history_section import history_section, history_summary
 from services.report.html import Html, inlined_svg, joined, table, tag
 from services.report.place import start_of
@@ -138,7 +138,6 @@ def _facts(report: BridgeReport, language: Language) -> Html:
     ]
     if report.view.estimate is not None:
         rows.append(("compared", _compared_with(report, language)))
-    rows.append(("road", _road(report.crossings, language)))
     if report.past is not None:
         rows.append(("over_time", history_summary(report.past, language)))
     return facts([(language.text(f"fact.{key}"), text) for key, text in rows])
@@ -255,14 +254,6 @@ def _caveats(report: BridgeReport, language: Language) -> Iterator[Html]:
 def _visible(comparison: Comparison, language: Language) -> str:
     losses = sorted(element.visible_loss for element in comparison.elements)
     return language.text("note.visible", low=per_cent_up(losses[0]), high=per_cent_up(losses[-1]))
-
-
-def _road(crossings: Sequence[CrossingResult], language: Language) -> str:
-    for crossing in reversed(crossings):
-        road = road_of(crossing, language)
-        if road is not None:
-            return language.text("road.newest", road=road)
-    return language.text("road.unknown")
 
 
 def _name(report: BridgeReport) -> str:

@@ -40,6 +40,9 @@ svg { width: 100%; height: auto; display: block; }
 .measures td { white-space: nowrap; }
 .measures td:first-child { padding-right: 4mm; }
 .measures td:last-child { white-space: normal; font-size: 0.94em; color: #3d4650; }
+.many.measures td:first-child { white-space: normal; width: 44%; }
+.many.measures td:last-child { font-size: inherit; color: inherit; white-space: nowrap; }
+.measures small { color: #3d4650; }
 .signature { border-top: 0.8pt solid #5b6570; padding-top: 1mm; margin-top: 9mm; width: 60%;
   font-size: 9pt; color: #5b6570; }
 .words { border-top: 0.8pt solid #5b6570; font-size: 9pt; margin-top: 3mm; }
@@ -62,12 +65,12 @@ tr.good td:first-child::before { content: "● "; }
   figure, tr, .finding { break-inside: avoid; }
   .evidence, .past, .words + .first { break-before: page; }
   .evidence table { font-size: 8.2pt; }
-  .evidence figure svg { max-height: 66mm; }
+  .evidence figure svg { max-height: 62mm; }
   .measures table { font-size: 7.8pt; }
   .measures td, .measures th { padding-top: 0.2mm; padding-bottom: 0.2mm; line-height: 1.25; }
   .note.how { display: none; }
   .past figure svg { max-height: 175mm; }
-  .first figure.wide svg { max-height: 49mm; }
+  .first figure.wide svg { max-height: 47mm; }
   .wide { overflow: visible; }
   h2, h3 { break-after: avoid; margin-top: 2mm; }
   .words { columns: 2; column-gap: 6mm; font-size: 7.5pt; line-height: 1.22; margin-top: 2mm; }

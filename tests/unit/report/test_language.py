@@ -120,7 +120,7 @@ def test_history_of_a_german_report_is_german(tmp_path: Path) -> None:
     axes = draw_history(noted, language=GERMAN).axes
     axes[-1].figure.canvas.draw()
     assert "März" in " ".join(label.get_text() for label in axes[-1].get_xticklabels())
-    assert [text.get_text() for text in axes[3].texts][0] == "weniger steif"
+    assert next(text.get_text() for text in axes[3].texts) == "weniger steif"
 
 
 def test_the_page_names_its_language(site: Site) -> None:

@@ -98,12 +98,21 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     assert "reduced chi-square (χ²/dof) 1.02 1.02 mean square of the residuals" in text
     assert "weight of the suspension equations (%) 100 100 100 %" in text
     assert "rotational restraint (%) 3 and 4 3 and 4 probability" in text
-    assert "R-hat 1 1 agreement" in text
+    assert "R-hat 1.004 1.004 agreement" in text
     assert "truck-1 south-west to north-east 10.0 pre good yes" in text
     # What measured, and when.
     assert "truck-1: 9.5 t, wheelbase 4.4 m, axle loads" in text
     assert "front and rear on body and axles" in text
     assert "Computed 2026-09-21 " in text
+
+
+def test_measures_of_many_crossings_keep_their_meanings_readable(site: Site) -> None:
+    """A column of its own would be some letters wide beside six crossings."""
+    many = [some_crossing(name, entry=60.0 * n) for n, name in enumerate("abcdef")]
+    text = reported(site, results_of(site, *many, used="f")).text
+    assert "R-hat agreement between parts of the draws; must be below 1.05 1.004 1.004" in text
+    assert "Meaning" not in text
+    assert "Meaning" in reported(site, results_of(site, *many[:3], used="c")).text
 
 
 def test_a_nominal_value_that_is_too_high_is_no_damage_everywhere(site: Site) -> None:
@@ -260,7 +269,8 @@ def test_several_surveys_are_fused_and_other_campaigns_are_named(site: Site) -> 
     files = []
     for number, survey in enumerate(surveys):
         state = fuse_bridge("bridge-1", survey)
-        assert state is not None and len(state.crossings_used) == 3
+        assert state is not None
+        assert len(state.crossings_used) == 3
         header = {"created": drives.created + number, "bridges": {"bridge-1": state}}
         files.append(drives.model_copy(update={"crossings": survey, **header}))
     together = fuse_bridge("bridge-1", drives.crossings)
