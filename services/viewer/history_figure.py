@@ -258,7 +258,8 @@ def _draw_element(
     axes.set_axisbelow(True)
     # Outside the panel, as points may be anywhere within it.
     axes.annotate(
-        f"100 %:\n{language.number(usual / 1e9, '#.3g')} GN·m²", (0.0, 0.5), xycoords="axes fraction", xytext=(-6, -8),
+        f"100 %:\n{language.number(usual / 1e9, '#.3g')} GN·m²", (0.0, 0.5),
+        xycoords="axes fraction", xytext=(-6, -8),
         textcoords="offset points", ha="right", va="top", fontsize=7, color=MUTED,
     )  # fmt: skip
     _over_time(axes, language)
