@@ -202,7 +202,8 @@ def _draw_heading(figure: Figure, bridge: BridgeView, lines: list[str]) -> None:
         colours = {"facecolor": BANNERS["suspect"], "edgecolor": VERDICT_COLOURS["suspect"]}
         banner = {"boxstyle": "round,pad=0.35", "linewidth": 1.4} | colours
     words = "\n".join(lines)
-    figure.text(LEFT + 0.006, top, words, fontsize=9.5, color=INK, va="top", bbox=banner)
+    left = LEFT if banner is None else LEFT + 0.006  # the banner's edge is beside the words
+    figure.text(left, top, words, fontsize=9.5, color=INK, va="top", bbox=banner)
 
 
 def _heading(bridge: BridgeView) -> list[str]:
@@ -214,7 +215,7 @@ def _heading(bridge: BridgeView) -> list[str]:
         sentences = f"No finding: none of {number} crossings could be used."
         if number == 1:
             sentences = "No finding: the only crossing could not be used."
-    return textwrap.wrap(doubt + sentences, 112, max_lines=3, placeholder=" …")
+    return textwrap.wrap(doubt + sentences, 112, max_lines=6, placeholder=" …")
 
 
 def _doubt(bridge: BridgeView) -> str:

@@ -12,6 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from schemas.reasons import Reason
+from services.common.language import ENGLISH
 from services.viewer.crossing_view import (
     VEHICLE_COLOURS,
     CrossingView,
@@ -243,12 +245,14 @@ def _unit_of_length(largest_m: float) -> tuple[str, float]:
 
 
 def _write_rejection(axes: Axes, crossing: CrossingView) -> None:
-    why = [
-        "• " + line
-        for text in crossing.reason_texts
-        for line in textwrap.wrap(text, 95, subsequent_indent="  ")
-    ]
-    write_centred(axes, "\n".join(("No estimate: the crossing was rejected.", *why)))
+    """Write all reasons, which the heading may shorten, and what to do next."""
+    advice = dict.fromkeys(ENGLISH.advice[Reason(code)] for code in crossing.reasons)
+    why, then = (
+        [line for text in texts for line in textwrap.wrap(f"• {text}", 95, subsequent_indent="  ")]
+        for texts in (crossing.reason_texts, advice)
+    )
+    lines = ["No estimate: the crossing was rejected.", *why]
+    write_centred(axes, "\n".join([*lines, "What to do next:", *then] if then else lines))
 
 
 def _leave_empty(axes: Axes) -> None:

@@ -13,7 +13,7 @@ from services.viewer.crossing_tab import crossing_layout, when_and_where
 from services.viewer.crossing_view import CrossingView, DetectedCrossingView
 from services.viewer.panels.place import bridge_places, map_view
 from services.viewer.panels.signals import acceleration_plots
-from services.viewer.rerun_parts import CHAINAGE, TIME, series_plot
+from services.viewer.rerun_parts import CHAINAGE, RATIO_LEGEND, TIME, series_plot
 from services.viewer.rerun_places import BridgeOnMap
 from services.viewer.strip import STRIP_PAPER
 from services.viewer.vehicle_signals import VehicleSignals
@@ -90,9 +90,10 @@ def _overview_layout(bridge: BridgeView, on_map: BridgeOnMap | None) -> rrb.Cont
         name="Stiffness, and all crossings",
         background=(255, 255, 255),
     )
+    is_coloured = bridge.estimate is not None and not bridge.is_doubtful
     side = rrb.Vertical(
         rrb.TextDocumentView(origin=f"{bridge_root(bridge)}/finding", name="Finding"),
-        bridge_places(on_map, coloured=bridge.estimate is not None and not bridge.is_doubtful),
+        bridge_places(on_map, legend=RATIO_LEGEND if is_coloured else ""),
     )
     name = f"Bridge {bridge.owner_id or bridge.bridge}"
     return rrb.Horizontal(picture, side, column_shares=[5, 2], name=name)
@@ -106,7 +107,7 @@ def _passing_layout(
     plots = acceleration_plots(f"{root}/acceleration", channels)
     return rrb.Vertical(
         *plots,
-        bridge_places(bridge, root, has_elements=False, coloured=False),
+        bridge_places(bridge, root, has_elements=False, legend=""),
         name=f"{when_and_where(passing)}, not identified",
     )
 

@@ -17,6 +17,7 @@ from services.viewer.strip import STRIP_WIDTH
 
 WINDOW_S: Final = 60.0
 """Time in s of accelerations and crossings before the cursor."""
+_FUSED: Final = "fused EI / nominal"
 WAITING = "waiting"
 """Entity of the page shown until the first message."""
 
@@ -66,8 +67,8 @@ def _blueprint(root: rrb.Container | rrb.View) -> rrb.Blueprint:
 
 
 def _where_and_when(on_map: Sequence[BridgeOnMap]) -> rrb.Container:
-    plans = [bridge_places(bridge, coloured=False, name=bridge.identifier) for bridge in on_map]
-    places = _tabs(plans) if plans else bridge_places(None, coloured=False)
+    plans = [bridge_places(bridge, legend=_FUSED, name=bridge.identifier) for bridge in on_map]
+    places = _tabs(plans) if plans else bridge_places(None, legend="")
     infinite = rrb.TimeRangeBoundary.infinite()
     shown = rrb.TimeRange(
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-WINDOW_S),
@@ -99,7 +100,7 @@ def _bridge(bridge: str) -> rrb.Container:
     infinite = rrb.TimeRangeBoundary.infinite()
     trend = rrb.TimeSeriesView(
         origin=trend_root(bridge),
-        name="Fused EI / nominal over time; white: lowest element, not necessarily weak",
+        name="Fused EI / nominal over time; white: lowest",
         axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=infinite, end=infinite)),
         axis_y=rrb.ScalarAxis(range=(0.0, 1.6)),
         time_ranges=[rrb.VisibleTimeRange(TIME, start=infinite, end=infinite)],

@@ -104,7 +104,7 @@ def _sensors(truck: TruckSummary, site: Site | None) -> list[str]:
 
 
 def _state(found: RecordingSummary) -> str:
-    cut = ", **cut off**" if found.info.truncated else ""
+    cut = ", **being written or cut off**" if found.info.truncated else ""
     damaged = found.info.damaged_chunks
     return f"{cut}, **{damaged} damaged places**" if damaged else cut
 

@@ -208,6 +208,8 @@ def series_plot(
     name: str,
     only: Sequence[str] | None = None,
     window_s: float | None = None,
+    *,
+    has_legend: bool = True,
 ) -> rrb.View:
     """Return a plot of a whole series, not only of its part before the cursor, or of a window."""
     start = end = rrb.TimeRangeBoundary.infinite()
@@ -224,5 +226,5 @@ def series_plot(
         name=name,
         time_ranges=shown,
         axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=start, end=end)),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=has_legend),
     )

@@ -227,14 +227,16 @@ def log_truck_on_plan(
 
 
 def log_truck_style(recording: RerunStream, entity: str, name: str | None = None) -> None:
-    """Define the style of a truck on a plan, with its name if there may be others."""
-    style = rr.Points2D.from_fields(
-        radii=rr.Radius.ui_points(6.0),
-        colors=[rgb(VEHICLE_COLOURS["rear"])],
-        labels=None if name is None else [name],
-        show_labels=None if name is None else True,
-    )
+    """Define the style of a truck on a plan, and of its name, if there may be others.
+
+    The name is a point of its own: Rerun writes below a point, where the bridge is.
+    """
+    colours = [rgb(VEHICLE_COLOURS["rear"])]
+    style = rr.Points2D.from_fields(radii=rr.Radius.ui_points(6.0), colors=colours)
     recording.log(entity, style, static=True)
+    if name is not None:
+        label = rr.Points2D.from_fields(radii=0.0, colors=colours, labels=[name], show_labels=True)
+        recording.log(f"{entity}/name", label, static=True)
 
 
 def send_places(

@@ -30,8 +30,9 @@ from services.viewer.vehicle_signals import VehicleSignals
 
 
 def _layout(scene: CrossingScene, crossing: CrossingView) -> rrb.Container | rrb.View:
-    coloured = crossing.rigidity_nm2 is not None and not crossing.is_doubtful
-    return bridge_places(scene.place if scene.is_mapped else None, scene.root, coloured=coloured)
+    is_coloured = crossing.rigidity_nm2 is not None and not crossing.is_doubtful
+    legend = RATIO_LEGEND if is_coloured else ""
+    return bridge_places(scene.place if scene.is_mapped else None, scene.root, legend=legend)
 
 
 def _log(recording: RerunStream, scene: CrossingScene, crossing: CrossingView) -> None:
@@ -55,13 +56,13 @@ def bridge_places(
     root: str | None = None,
     *,
     has_elements: bool = True,
-    coloured: bool,
+    legend: str,
     name: str | None = None,
 ) -> rrb.Container | rrb.View:
     """Lay out the plan of a bridge and the map, whose background needs a network.
 
-    With the root of a crossing, truck and elements are those of this crossing. Elements are
-    `coloured` if their EI is known.
+    With the root of a crossing, truck and elements are those of this crossing. The `legend` of
+    the elements is part of the title.
     """
     own = [f"/{root}/map"] if root is not None and has_elements else ["/map/bridge/**"]
     own += ["/map/position/**"] if root is None else [f"/{root}/position"]
@@ -77,7 +78,7 @@ def bridge_places(
         drawn.append(f"/{plan}/elements/**")
     view = flat_view(
         "/",
-        f"Plan (m), {RATIO_LEGEND}" if coloured else "Plan (m)",
+        f"Plan (m), {legend}" if legend else "Plan (m)",
         (-PLAN_MARGIN * span, (1.0 + PLAN_MARGIN) * span),
         (-0.25 * span, 0.4 * span),
         [*around, *drawn],

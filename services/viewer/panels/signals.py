@@ -50,7 +50,7 @@ def _layout(scene: CrossingScene, shown: _Shown) -> rrb.Container:
         apart = "Front minus rear" if first == 1 else f"Axle {first} minus axle {first + 1}"
         plots = [
             series_plot(f"{root}/road", "Road profile (mm)"),
-            series_plot(f"{root}/road_difference", f"{apart} (mm)"),
+            series_plot(f"{root}/road_difference", f"{apart} (mm)", has_legend=False),
             *plots,
         ]
     return rrb.Vertical(*plots, name="Signals")

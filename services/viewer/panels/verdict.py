@@ -6,6 +6,8 @@ from typing import Final
 
 import rerun.blueprint as rrb
 
+from schemas.reasons import Reason
+from services.common.language import ENGLISH
 from services.identification.comparison import Comparison
 from services.viewer.crossing_scene import CrossingScene, Panel
 from services.viewer.crossing_view import CrossingView, describe_crossing, summary_line
@@ -24,18 +26,26 @@ def _log(recording: RerunStream, scene: CrossingScene, crossing: CrossingView) -
 PANEL: Final = Panel(lambda scene: scene.crossing, _layout, _log)
 
 
+def _advice(crossing: CrossingView) -> list[str]:
+    """Return what to do about each reason, as Markdown."""
+    advice = dict.fromkeys(ENGLISH.advice[Reason(code)] for code in crossing.reasons)
+    return ["", "**What to do next**", "", *(f"- {one}" for one in advice)] if advice else []
+
+
 def verdict_markdown(crossing: CrossingView, compared: Comparison | None = None) -> str:
-    """Return verdict, reasons, result and a table of all parameters, as Markdown."""
+    """Return verdict, reasons, result, advice and a table of all parameters, as Markdown."""
     lines = [f"# {crossing.verdict.capitalize()}", ""]
     if crossing.verdict == "suspect":
         lines += ["**Doubtful. Do not rely on these values.**", ""]
     lines += [summary_line(crossing), ""]
     lines += [f"- {text}" for text in crossing.reason_texts]
     if crossing.rigidity_nm2 is None:
-        return "\n".join([*lines, "", "No estimate is given for a rejected crossing."])
+        nothing = "No estimate is given for a rejected crossing."
+        return "\n".join([*lines, "", nothing, *_advice(crossing)])
     wording = describe_crossing(crossing, compared)
     if wording:
         lines += ["", " ".join(wording)]
+    lines += _advice(crossing)
     lines += ["", "| | estimate | 95 % interval | ratio |", "|---|---|---|---|"]
     for index, value in enumerate(crossing.rigidity_nm2):
         interval = "–"

@@ -13,7 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.patches import Rectangle
 
+from schemas.reasons import Reason
 from services.common.errors import InputError
+from services.common.language import ENGLISH
 from services.viewer.crossing_view import CrossingView, RoadView
 from services.viewer.drawing import STYLE
 from services.viewer.figure import crossing_figure, draw_crossing
@@ -141,6 +143,8 @@ def test_rejected_crossing_shows_its_reason_and_no_number() -> None:
     written = [text.get_text() for text in words(figure)]
     assert any(reason in text for text in written)
     assert "verdict: rejected" in written
+    advice = ENGLISH.advice[Reason.CHANNEL_MISSING]
+    assert any(advice[:60] in text for text in written)
     assert not any(text.startswith("$EI") for text in written)
 
 

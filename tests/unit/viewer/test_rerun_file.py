@@ -26,6 +26,7 @@ from schemas.site_file import parse_site
 from schemas.topics import Key, Message
 from services.cli import main as cli
 from services.common.errors import InputError
+from services.common.language import ENGLISH
 from services.recordings.writer import write_recording
 from services.viewer import rerun_file
 from services.viewer.crossing_scene import CrossingScene, crossing_root
@@ -322,6 +323,7 @@ def test_rejected_crossing_shows_its_reason_and_no_number(tmp_path: Path, site: 
     assert f"{root}/verdict" in paths(chunks)
     assert not any(path.startswith((f"{root}/rigidity", f"{root}/strip")) for path in paths(chunks))
     text = verdict_markdown(view_of_crossing(rejected(), site.bridges[0]))
+    assert all(f"- {ENGLISH.advice[code]}" in text for code in rejected().reasons)
     assert text.startswith("# Rejected")
     assert "lacks one of the four accelerometers" in text
     assert "EI_" not in text
