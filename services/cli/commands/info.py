@@ -252,7 +252,7 @@ def _count(number: int, what: str) -> str:
 def _state(one: "RecordingSummary") -> str:
     damage = f", {one.info.damaged_chunks} damaged places" if one.info.damaged_chunks else ""
     if one.info.truncated:
-        return f"cut off{damage}"
+        return f"being written or cut off{damage}"
     return f"whole{damage}" if not damage else damage.removeprefix(", ")
 
 

@@ -130,10 +130,11 @@ def check_overlap(
             f"{part.sheet.path}: begins {apart_s:+.3f} s from {name}, the clocks of both must "
             f"agree{hint}; offset_s in [file.time] of a map{option} corrects one"
         )
+    side = "after" if quarters > 0 else "before"
     raise InputError(
-        f"{part.sheet.path}: begins {apart_s:+.3f} s from {name}, {abs(quarters) / 4:g} h: another "
-        f"time zone: the clocks must agree; set offset_s = {-900.0 * quarters:.0f} in its "
-        "[file.time] of a map (--map), or zone"
+        f"{part.sheet.path}: begins {abs(quarters) / 4:g} h {side} {name}, which looks "
+        "like another time zone; the clocks must agree: set offset_s = "
+        f"{-900.0 * quarters:.0f} in its [file.time] of a map (--map), or zone"
     )
 
 

@@ -47,9 +47,9 @@ def test_a_folder_is_a_line_a_file_and_a_sum(
         "from", "(UTC)", "length", "trucks", "crossings", "gaps", "size", "state", "recording",
     ]  # fmt: skip
     assert first.startswith("2023-11-14 22:13:20  9.9 s")
-    assert first.split("  ")[-1] == str(folder / "one.mcap")
+    assert first.split()[-1] == str(folder / "one.mcap")
     assert "not known" in first  # there is no site file
-    assert "cut off" in second
+    assert "being written or cut off" in second  # from outside both look alike
     assert none.startswith(f"{folder / 'none.mcap'}: is not an MCAP file")
     assert total.startswith("3 recordings, ")
     assert total.endswith(", 2 trucks, 0 crossings")

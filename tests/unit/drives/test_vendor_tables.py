@@ -776,8 +776,8 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, str | bytes]], str]] = {
     "clocks an hour apart": (
         lambda: pair(with_times(ACCEL, ACCEL["time_s"] + 3600)),
         (
-            "gps_00.csv: begins -3600.000 s from accel_00.csv, 1 h: another "
-            "time zone: the clocks must agree; set offset_s = 3600"
+            "gps_00.csv: begins 1 h before accel_00.csv, which looks like another time zone; "
+            "the clocks must agree: set offset_s = 3600 in its"
         ),
     ),
     "local times": (
