@@ -260,6 +260,8 @@ def take_terminal(folder: Path, columns: int, lines: int = 36) -> bytes:
         page(watched, where, listened, now_s=NOW_S, now_ns=NOW_NS, width=columns, height=lines)
     )
     svg = shown.export_svg(title="driveby watch")
+    # Rich's font is on the internet: a browser may take its picture before that has answered.
+    svg = re.sub(r"@font-face\s*{.*?}", "", svg, flags=re.DOTALL)
     width, height = (float(size) for size in re.findall(r'viewBox="0 0 (\S+) (\S+)"', svg)[0])
     drawn = folder / "terminal.svg"
     drawn.write_text(svg)
@@ -269,7 +271,9 @@ def take_terminal(folder: Path, columns: int, lines: int = 36) -> bytes:
 def smaller(png: bytes) -> bytes:
     """With 128 colours, which is all that lines and words need."""
     written = io.BytesIO()
-    few = Image.open(io.BytesIO(png)).convert("RGB").quantize(128, dither=Image.Dither.NONE)
+    # The median cut, which is the default, merges small patches of different colours.
+    method, dither = Image.Quantize.FASTOCTREE, Image.Dither.NONE
+    few = Image.open(io.BytesIO(png)).convert("RGB").quantize(128, method=method, dither=dither)
     few.save(written, "png", optimize=True)
     assert len(written.getvalue()) < MAX_BYTES, f"{len(written.getvalue())} bytes"
     return written.getvalue()
