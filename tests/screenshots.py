@@ -271,9 +271,9 @@ def take_terminal(folder: Path, columns: int, lines: int = 36) -> bytes:
 def smaller(png: bytes) -> bytes:
     """With 128 colours, which is all that lines and words need."""
     written = io.BytesIO()
-    # The median cut, which is the default, merges small patches of different colours.
-    method, dither = Image.Quantize.FASTOCTREE, Image.Dither.NONE
-    few = Image.open(io.BytesIO(png)).convert("RGB").quantize(128, method=method, dither=dither)
+    # The median cut alone merges small patches of different colours; k-means parts them again.
+    few = Image.open(io.BytesIO(png)).convert("RGB")
+    few = few.quantize(128, kmeans=1, dither=Image.Dither.NONE)
     few.save(written, "png", optimize=True)
     assert len(written.getvalue()) < MAX_BYTES, f"{len(written.getvalue())} bytes"
     return written.getvalue()

@@ -373,10 +373,12 @@ def _print(console: "Console", crossing: CrossingResult, drive: SimulatedDrive, 
     parameters = crossing.parameters or {}
     nominal = site.bridge(crossing.bridge).nominal_flexural_rigidity_nm2
     has_meaning = "no_noise_model" not in crossing.reasons
-    table = Table(title="Flexural rigidity as a ratio to the sound bridge", title_justify="left")
+    table = Table(
+        title="Flexural rigidity as a ratio to the undamaged bridge", title_justify="left"
+    )
     table.add_column("element")
     misses = 0
-    for heading in ("truth", "estimate", "interval (95 %)", "holds the truth"):
+    for heading in ("truth", "estimate", "interval (95 %)", "contains the truth"):
         table.add_column(heading, justify="right")
     for number, (sound, truth) in enumerate(
         zip(nominal, drive.rigidity_ratios, strict=True), start=1

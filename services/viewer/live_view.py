@@ -74,7 +74,7 @@ from services.viewer.rerun_places import (
     log_surroundings,
     log_truck_style,
     plan_root,
-    send_places,
+    send_named_places,
 )
 
 MAX_TRUCKS: Final = 6
@@ -82,8 +82,6 @@ MAX_TRUCKS: Final = 6
 MAX_BRIDGES: Final = 8
 """Maximum number of bridges with a tab: those that were approached or crossed first."""
 _PLACES_EVERY_S: Final = 1.0
-_NAME_ABOVE: Final = 0.13
-"""Distance of a truck's name from it, over the span."""
 """Interval in s at which a truck is moved on the map and the plans.
 
 Each move takes a kilobyte per view, at a server that keeps the history for later viewers.
@@ -272,10 +270,8 @@ class LiveView:
             if bridge in self._bridges:
                 along, left = to_chainage(self._site[bridge].frame, *places.T)
                 entity = f"{plan_root(bridge)}/truck/{vehicle}"
-                where = np.column_stack((along, -left))
-                send_places(self._recording, entity, where, time_ns)
-                above = where - [0.0, _NAME_ABOVE * self._site[bridge].on_map.span_m]
-                send_places(self._recording, f"{entity}/name", above, time_ns)
+                where, span_m = np.column_stack((along, -left)), self._site[bridge].on_map.span_m
+                send_named_places(self._recording, entity, where, time_ns, span_m)
 
     def _draw_result(self, view: CrossingView, rigidity_nm2: FloatArray, moment_ns: int) -> str:
         """Draw EI along the span with the roads below it; return sentences on the result."""

@@ -42,6 +42,8 @@ PLAN_MARGIN = 0.3
 """Margin of the plan before and after the bridge, as a share of the span."""
 _HALF_WIDTH = 0.02
 """Half width of a bridge in the plan, as a share of the span: its width is unknown."""
+_NAME_ABOVE = 0.13
+"""Distance of a truck's name from it, as a share of the span."""
 
 
 class BridgeOnMap(NamedTuple):
@@ -250,6 +252,14 @@ def send_places(
     recording.send_columns(
         entity, columns_of(time_ns, chainage_m), rr.Points2D.columns(positions=places_m)
     )
+
+
+def send_named_places(
+    recording: RerunStream, entity: str, places_m: FloatArray, time_ns: IntArray, span_m: float
+) -> None:
+    """Log positions of a truck on the plan of a bridge (f, 2), and of its name above them."""
+    send_places(recording, entity, places_m, time_ns)
+    send_places(recording, f"{entity}/name", places_m - [0.0, _NAME_ABOVE * span_m], time_ns)
 
 
 def log_vehicle(recording: RerunStream, vehicle: str, fixes: Sequence[GnssFix]) -> None:

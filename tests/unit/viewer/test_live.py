@@ -184,6 +184,10 @@ def test_a_drive_is_drawn_with_bounded_rates(live: Live) -> None:
     along = [x for (x, _) in values(rows(chunks, "plan/bridge-1/truck/truck-1"), "positions")]
     assert len(along) == 50
     assert np.all(np.diff(along) > 0.0)
+    # Its name is above the track, as the bridge is below.
+    names = values(rows(chunks, "plan/bridge-1/truck/truck-1/name"), "positions")
+    truck = values(rows(chunks, "plan/bridge-1/truck/truck-1"), "positions")
+    assert all(name[1] < dot[1] - 3.0 for name, dot in zip(names, truck, strict=True))
 
 
 def test_nothing_for_all_times_but_looks(live: Live, site: Site) -> None:
