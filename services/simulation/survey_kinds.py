@@ -26,8 +26,9 @@ class SurveyKind(NamedTuple):
     everything: bool = False
     """Springs that rub, bearings that give, damped tyres, a lorry that has just left."""
     scenario: int | None = None
-    """EI is that of this scenario of the paper, all elements at one level that is drawn; None: each
-    element's is drawn."""
+    """EI is that of this scenario of the paper, all elements at one level that is drawn."""
+    ei_ratios: tuple[float, ...] | None = None
+    """Ratios of EI instead of a scenario; with neither, each element's EI is drawn."""
     noise_ug_per_rthz: float = 25.0
     deck_roughness: float = 1.0
     """Roughness of the pavement on the bridge over that of the road."""
@@ -66,6 +67,7 @@ KINDS: Final = {
     "tandem": SurveyKind(12, has_tandem=True),
     "tandem-rubbing": SurveyKind(12, has_tandem=True, friction_share=0.08),
     "tandem-aside": SurveyKind(12, has_tandem=True, offset_m=0.02),
+    "tandem-weak": SurveyKind(8, has_tandem=True, ei_ratios=(1.0, 1.0, 0.8, 1.0, 1.0, 1.0, 1.0)),
     "everything": SurveyKind(16, tyres="twin", masses_kg=(_LORRY_KG,), everything=True),
     "scenario-1": SurveyKind(16, scenario=1, noise_ug_per_rthz=100.0),
     "scenario-4": SurveyKind(16, scenario=4, noise_ug_per_rthz=100.0),

@@ -22,10 +22,9 @@ from services.identification.bridge_state import (
     usable,
 )
 from services.identification.comparison import Comparison
-from services.simulation.drive import ratios_of
 from services.simulation.survey_kinds import KINDS
 from studies.validation.calibration import Record
-from studies.validation.surveys import by_survey
+from studies.validation.surveys import by_survey, weak_ratios
 
 SIZES: Final = (1, 2, 4, 8, 16)
 """Numbers of crossings that are fused."""
@@ -71,17 +70,16 @@ def groups_of(
     sizes: Sequence[int] = SIZES,
     progress: Steps = no_step_progress,
 ) -> list[CrossingGroup]:
-    """Return groups of all surveys of these records with the EI of a scenario, of this bridge."""
+    """Return groups of all surveys of these records with weak elements, of this bridge."""
     nominal = np.array(bridge.nominal_flexural_rigidity_nm2)
     lengths = np.array(bridge.lengths_m)
     found = []
     surveys = by_survey(records)
     for number, ((kind, _), lines) in enumerate(surveys.items()):
         progress(number, len(surveys))
-        scenario = KINDS[kind].scenario
-        if scenario is None:
+        ratios = weak_ratios(bridge, KINDS[kind])
+        if ratios is None:
             continue
-        ratios = ratios_of(bridge, scenario, None)
         weak = frozenset((1 + np.flatnonzero(ratios < ratios.max())).tolist())
         for size in sizes:
             for first in range(0, len(lines) - size + 1, size):

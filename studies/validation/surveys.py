@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pre_core.physics.bridge import Beam
 from schemas.results import BridgeResult, CrossingResult
 from schemas.settings import IdentificationSettings
-from schemas.site import Site, Vehicle
+from schemas.site import Bridge, Site, Vehicle
 from services.common.progress import Steps, no_step_progress
 from services.drives.runs import Run
 from services.finding.placed import middle_site
@@ -186,13 +186,20 @@ def _survey_truth(site: Site, kind: SurveyKind, survey: int) -> Floats:
 def _bridge(site: Site, kind: SurveyKind, survey: int) -> Beam:
     """Return the mean of the changing bridge."""
     drawn = draw_truth(site, 1000 * survey).beam
-    if kind.scenario is None:
+    ratios = weak_ratios(site.bridges[0], kind)
+    if ratios is None:
         return drawn
     rng = np.random.default_rng(np.random.SeedSequence([survey, 0x1E7E1]))
     level = np.exp(_LEVEL_SPREAD * rng.standard_normal())
     nominal = np.array(site.bridges[0].nominal_flexural_rigidity_nm2)
-    ratios = ratios_of(site.bridges[0], kind.scenario, None)
     return drawn._replace(flexural_rigidity_nm2=level * nominal * ratios)
+
+
+def weak_ratios(bridge: Bridge, kind: SurveyKind) -> Floats | None:
+    """Return EI (n,) over its level in a kind of survey with weak elements; None: EI is drawn."""
+    if kind.scenario is None and kind.ei_ratios is None:
+        return None
+    return ratios_of(bridge, kind.scenario, kind.ei_ratios)
 
 
 def run_surveys(
