@@ -5,9 +5,11 @@ import pytest
 
 from schemas.site import Bridge
 from services.simulation.drawn import default_site
+from services.simulation.survey_kinds import KINDS
 from studies.validation import detection
 from studies.validation.calibration import Record
 from studies.validation.detection import CrossingGroup, groups_of
+from studies.validation.surveys import crossing_truth
 from tests.unit.identification.test_fusing import crossing
 
 WEAK = (1.0, 1.0, 1.0, 0.7, 1.0, 1.0, 1.0)
@@ -44,6 +46,15 @@ def test_a_weak_element_is_seen_and_no_sound_one() -> None:
         low, middle, high = line.loss
         assert 0.2 < low < middle < high < 0.4
         assert middle == pytest.approx(0.3, abs=0.05)
+
+
+def test_weak_element_of_a_tandem_survey_is_that_of_its_ratios() -> None:
+    records = [record("tandem-weak", 0, n) for n in range(2)]
+    (group,) = groups_of([*records, record("tandem", 0, 0)], bridge(), (2,))
+    assert (group.kind, group.weak) == ("tandem-weak", frozenset({3}))
+    truth, _ = crossing_truth(default_site(), KINDS["tandem-weak"], 0, 0, 0)
+    ratios = truth.beam.flexural_rigidity_nm2 / truth.beam.flexural_rigidity_nm2[0]
+    np.testing.assert_allclose(ratios, [1.0, 1.0, 0.8, 1.0, 1.0, 1.0, 1.0])
 
 
 def test_a_sound_element_that_is_called_weak_is_an_accusation() -> None:
