@@ -17,6 +17,7 @@ def next_steps(report: BridgeReport, language: Language) -> Iterator[str]:
     match report.finding.kind:
         case "weak":
             yield from _inspect(report, language)
+            yield from _implausible(report, language)
             yield from _drive_again(report, language)
         case "sound":
             yield language.text("advice.sound")
@@ -51,17 +52,29 @@ def _inspect(report: BridgeReport, language: Language) -> Iterator[str]:
     """Yield where to inspect."""
     elements = () if report.view.comparison is None else report.view.comparison.elements
     weak = [one for one in elements if one.is_weak]
-    places = ", ".join(
-        language.text(
-            "advice.place",
-            number=one.number,
-            position=position_of(one, report.bridge, language),
-        )
-        for one in weak
+    places = language.listed(
+        [
+            language.text(
+                "advice.place",
+                number=one.number,
+                position=position_of(one, report.bridge, language),
+            )
+            for one in weak
+        ]
     )
     at_end = any(one.number in (1, len(elements)) for one in weak)
     step = language.text("advice.inspect_bearing" if at_end else "advice.inspect", places=places)
     yield step if report.before is not None else f"{step} {language.text('advice.unlike')}"
+
+
+def _implausible(report: BridgeReport, language: Language) -> Iterator[str]:
+    """Yield what an element that is clearly stiffer means for the others: errors are opposite."""
+    comparison = report.view.comparison
+    stiff = [one for one in comparison.elements if one.is_stiff] if comparison is not None else []
+    if stiff:
+        numbers = language.listed([str(one.number) for one in stiff])
+        against = "others" if report.before is None else "baseline"
+        yield language.choice(f"advice.stiffer.{against}", len(stiff), elements=numbers)
 
 
 def _drive_again(report: BridgeReport, language: Language) -> Iterator[str]:

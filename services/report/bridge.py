@@ -221,9 +221,19 @@ def _before(
     return Before(name, estimate, state.verdict or "good", crossings)
 
 
-def _one_by_one(view: BridgeView, baseline: Estimate | None, language: Language) -> Iterator[str]:
-    """Yield a sentence on the scatter of the good crossings at a weak element."""
-    good = [c for c in view.crossings if c.verdict == "good" and c.interval_nm2 is not None]
+def _one_by_one(
+    view: BridgeView,
+    crossings: Sequence[CrossingResult],
+    baseline: Estimate | None,
+    language: Language,
+) -> Iterator[str]:
+    """Yield a sentence on the scatter of the good crossings of the campaign at weak elements."""
+    own = {one.crossing_id for one in crossings if one.realm == crossings[-1].realm}
+    good = [
+        one
+        for one in view.crossings
+        if one.verdict == "good" and one.interval_nm2 is not None and one.crossing_id in own
+    ]
     if view.comparison is None or len(good) < 2:
         return
     found = []
@@ -232,17 +242,16 @@ def _one_by_one(view: BridgeView, baseline: Estimate | None, language: Language)
         assert crossing.interval_nm2 is not None  # noqa: S101
         estimate = Estimate(crossing.rigidity_nm2, *crossing.interval_nm2.T)
         found.append(compare(estimate, view.nominal_nm2, view.edges_m, baseline))
+    number, elements = 0, []
     for weak in view.comparison.weak:
         losses = [1.0 - one.elements[weak.number - 1].ratio for one in found if one is not None]
         if len(losses) >= 2:
             low, high = 100.0 * min(losses), 100.0 * max(losses)
             key = "losses.same" if round(low) == round(high) else "losses.range"
-            yield language.text(
-                "finding.scatter",
-                number=len(losses),
-                element=weak.number,
-                losses=language.text(key, low=low, high=high),
-            )
+            number, text = len(losses), language.text(key, low=low, high=high)
+            elements.append(language.text("losses.element", element=weak.number, losses=text))
+    if elements:
+        yield language.text("finding.scatter", number=number, elements=language.listed(elements))
 
 
 def _finding(
@@ -253,7 +262,7 @@ def _finding(
 ) -> BridgeFinding:
     if view.estimate is None:
         return _no_finding(crossings, language)
-    wording = (*describe_bridge(view, language), *_one_by_one(view, baseline, language))
+    wording = (*describe_bridge(view, language), *_one_by_one(view, crossings, baseline, language))
     if view.is_doubtful:
         why = dict.fromkeys(_reasons_of_state(view, crossings, language))
         because = (language.text("finding.reasons", reasons=" ".join(why)),) if why else ()

@@ -65,12 +65,12 @@ tr.good td:first-child::before { content: "● "; }
   figure, tr, .finding { break-inside: avoid; }
   .evidence, .past, .words + .first { break-before: page; }
   .evidence table { font-size: 8.2pt; }
-  .evidence figure svg { max-height: 62mm; }
+  .evidence figure svg { max-height: 58mm; }
   .measures table { font-size: 7.8pt; }
   .measures td, .measures th { padding-top: 0.2mm; padding-bottom: 0.2mm; line-height: 1.25; }
   .note.how { display: none; }
   .past figure svg { max-height: 175mm; }
-  .first figure.wide svg { max-height: 47mm; }
+  .first figure.wide svg { max-height: 45mm; }
   .wide { overflow: visible; }
   h2, h3 { break-after: avoid; margin-top: 2mm; }
   .words { columns: 2; column-gap: 6mm; font-size: 7.5pt; line-height: 1.22; margin-top: 2mm; }
@@ -78,6 +78,7 @@ tr.good td:first-child::before { content: "● "; }
   .words p { break-inside: avoid; margin: 0.5mm 0; }
   .finding p { margin: 0.3mm 0; }
   .note, .first ul { font-size: 8pt; line-height: 1.25; }
+  :lang(de) .note, :lang(de) .first ul { font-size: 7.7pt; }
   .first table { font-size: 8.4pt; line-height: 1.3; margin: 1mm 0; }
   .sketch { flex-basis: 30mm; margin: 0; }
   .signature { margin-top: 7mm; break-inside: avoid; break-before: avoid; }

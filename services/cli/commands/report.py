@@ -85,6 +85,11 @@ def _report(asked: ReportOptions) -> int:
         print(f"{report.bridge.id}: {report.finding.headline} {' '.join(report.finding.sentences)}")
     if not reports:
         print("no crossing of a known bridge")
+    if asked.baseline is None and len(files) > 1:
+        print(
+            "the crossings of all files are fused; to see what has changed between surveys: "
+            "driveby report LATER.json --baseline EARLIER.json"
+        )
     print(output)
     if asked.pdf:
         browser = find_browser()

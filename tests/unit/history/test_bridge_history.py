@@ -118,7 +118,7 @@ def test_report_page_shows_months_elements_and_alarms(past: BridgeHistory) -> No
     assert f"{newest.mean / usual:.3f} 5 " in found.text
     assert found.tags.count("figure") == 1
     assert history_summary(past) == (
-        "34 crossings in 2 months; not monitored for changes (see the page on the bridge over time)"
+        "34 crossings in 2 months; not monitored for changes (see below)"
     )
 
 

@@ -110,7 +110,7 @@ def test_measures_of_many_crossings_keep_their_meanings_readable(site: Site) -> 
     """A column of its own would be some letters wide beside six crossings."""
     many = [some_crossing(name, entry=60.0 * n) for n, name in enumerate("abcdef")]
     text = reported(site, results_of(site, *many, used="f")).text
-    assert "R-hat agreement between parts of the draws; must be below 1.05 1.004 1.004" in text
+    assert "R-hat agreement of parts of the draws; below 1.05 is needed 1.004 1.004" in text
     assert "Meaning" not in text
     assert "Meaning" in reported(site, results_of(site, *many[:3], used="c")).text
 
@@ -249,6 +249,33 @@ def test_what_single_crossings_say_of_a_weak_element_shows_how_far_they_scatter(
     said = "From each of the 2 good crossings alone, element 4 is 50 to 60 % less stiff; the"
     assert said in reported(site, merged).text
     assert "crossings alone" not in reported(site, one).text
+
+
+def test_an_element_that_seems_stiffer_is_a_warning_of_its_neighbours(
+    site: Site, tmp_path: Path
+) -> None:
+    then = tmp_path / "then.json"
+    then.write_text(results_json(results_of(site, some_crossing("a"), used="a")))
+    ratios = RATIOS.copy()
+    ratios[3:5] *= 0.6, 2.0
+    now = results_of(site, some_crossing("b"), used="b", ratios=ratios)
+    assert "Element 5 appears stiffer than before, which" in reported(site, now, baseline=then).text
+    assert "If element 5 was not built stiffer than the others" in reported(site, now).text
+    usual = results_of(site, some_crossing("b"), used="b")
+    assert "stiffer" not in reported(site, usual).text
+
+
+def test_several_weak_elements_share_a_sentence_on_single_crossings(site: Site) -> None:
+    ratios = RATIOS.copy()
+    ratios[1] = 0.5
+    files = [results_of(site, some_crossing("a"), used="a", ratios=ratios)]
+    files.append(results_of(site, some_crossing("b", entry=60.0), used="b", ratios=ratios))
+    text = reported(site, *files).text
+    assert (
+        "From each of the 2 good crossings alone, element 4 is 60 % and element 2 is 50 %" in text
+    )
+    assert text.count("crossings alone") == 1
+    assert "element 2 (4.3 to 8.6 m from the south-west end) and element 4 (" in text
 
 
 def test_several_files_are_one_report_and_the_newest_result_of_a_crossing_counts(
