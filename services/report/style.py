@@ -3,7 +3,7 @@
 from services.common.language import Language
 
 _CSS = """
-@page { size: A4; margin: 13mm 15mm 15mm; @bottom-right { content: "PAGE_NUMBER";
+@page { size: A4; margin: 11mm 15mm 14mm; @bottom-right { content: "PAGE_NUMBER";
   font: 8pt "DejaVu Sans", Verdana, Arial, sans-serif; color: #5b6570; } }
 * { box-sizing: border-box; }
 body { font: 10.5pt/1.38 "DejaVu Sans", Verdana, Arial, sans-serif; color: #1b1f24;
@@ -61,7 +61,7 @@ tr.good td:first-child::before { content: "● "; }
   .signature { width: 100%; }
 }
 @media print {
-  body { padding: 0; font-size: 9.5pt; }
+  body { padding: 0; font-size: 9.5pt; line-height: 1.31; }
   figure, tr, .finding { break-inside: avoid; }
   .evidence, .past, .words + .first { break-before: page; }
   .evidence table { font-size: 8.2pt; }
@@ -78,7 +78,8 @@ tr.good td:first-child::before { content: "● "; }
   .words p { break-inside: avoid; margin: 0.5mm 0; }
   .finding p { margin: 0.3mm 0; }
   .note, .first ul { font-size: 8pt; line-height: 1.25; }
-  :lang(de) .note, :lang(de) .first ul { font-size: 7.7pt; }
+  :lang(de) .first { font-size: 8.8pt; }
+  :lang(de) .note, :lang(de) .first ul { font-size: 7.4pt; line-height: 1.22; }
   .first table { font-size: 8.4pt; line-height: 1.3; margin: 1mm 0; }
   .sketch { flex-basis: 30mm; margin: 0; }
   .signature { margin-top: 7mm; break-inside: avoid; break-before: avoid; }

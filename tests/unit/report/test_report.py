@@ -579,6 +579,27 @@ def test_on_paper_the_first_page_of_an_end_that_is_weak_is_one_sheet(
     assert number_of_sheets(tmp_path / "r.pdf") == 2
 
 
+@pytest.mark.process
+@pytest.mark.parametrize("code", ["en", "de"])
+def test_on_paper_the_first_page_of_a_comparison_is_one_sheet(
+    site: Site, tmp_path: Path, browser: str, code: str
+) -> None:
+    """German needs more room: two lines were alone on the second sheet."""
+    then, html, words = tmp_path / "then.json", tmp_path / "r.html", language_of(code)
+    then.write_text(results_json(fused(site, KNOWN)))
+    ratios = RATIOS.copy()
+    ratios[3:6] *= 0.6, 2.0, 0.7
+    survey = (some_crossing(name, entry=9e6 + 60.0 * n) for n, name in enumerate("xyz"))
+    now = results_of(site, *survey, used="z", ratios=ratios)
+    reports = bridge_reports([(Path("drive.json"), now, site)], then, language=words)
+    first, evidence, _ = page(reports, language=words).partition('<section class="evidence"')
+    assert evidence
+    assert words.choice("advice.stiffer.baseline", 1, elements="5") in first
+    html.write_text(f"{first}</body></html>")
+    pdf.write_pdf(html, tmp_path / "r.pdf", browser)
+    assert number_of_sheets(tmp_path / "r.pdf") == 1
+
+
 def test_fused_crossings_are_listed_with_their_agreement(site: Site) -> None:
     text = reported(site, fused(site, KNOWN, left_out=("suspect", "disagrees"))).text
     assert "One element is clearly less stiff." in text
