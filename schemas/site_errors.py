@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import math
 import re
 from collections.abc import Iterator
 from typing import Any, Final
@@ -235,7 +236,9 @@ def _list_expected(key: str, tables: Tables) -> str:
 
 
 def _shown(value: object) -> str:
-    """Return a value as TOML would show it, cut to fit a line."""
+    """Return a value as TOML would show it, cut to fit a line; a template has nan to replace."""
+    if isinstance(value, float) and math.isnan(value):
+        return "NaN (not filled in)"
     try:
         text = json.dumps(value, ensure_ascii=False)
     except (TypeError, ValueError):

@@ -67,6 +67,14 @@ class Parser(argparse.ArgumentParser):
             current = with_config(self, current)
         return super().parse_known_args([*current, *given[ends:]], namespace)
 
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse arguments; what no option takes is an error of the command that was given."""
+        found, rest = self.parse_known_args(args, namespace)
+        if rest:
+            prog = getattr(found, "parser", self).prog
+            raise InputError(f"unrecognized arguments: {' '.join(rest)} (see {prog} --help)")
+        return found
+
     def _current(self, argument: str) -> str:
         option, equals, value = argument.partition("=")
         return self.former_options.get(option, option) + equals + value

@@ -31,7 +31,7 @@ def noise_of(name: str, still: NoiseSegment | None, declared_ug: float) -> Check
         return CheckFinding(
             "noise",
             CheckStatus.OPEN,
-            f"{name}: noise at most {measured}, {declared_ug:g} declared: the truck's own motion "
+            f"{name}: noise at most {measured}, {declared_ug:g} declared; the truck's own motion "
             "hides it",
             "record a minute at standstill, engine off",
         )

@@ -40,6 +40,8 @@ CHANNEL_COLOURS = {
 }
 _OTHER_CHANNELS = ("#0072B2", "#CC79A7", "#999999", "#44AA99", "#882255", "#DDCC77")
 MUTED = "#9AA5B1"
+LABEL = "#FFFFFF"
+"""Colour of texts in dark views: in the light theme their boxes are grey, as `MUTED` is."""
 WEAK, BASELINE = "#E69F00", "#009E73"
 UNKNOWN = "#CC79A7"
 """Colour of a bridge with unknown EI, distinct from those with a meaning."""
@@ -152,7 +154,7 @@ def log_labels(
     across: FloatArray,
     down: FloatArray,
     *,
-    colour: str = MUTED,
+    colour: str = LABEL,
 ) -> None:
     """Draw texts in a 2-D view, each centred a little below its point; coordinates (n,)."""
     recording.log(

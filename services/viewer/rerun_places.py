@@ -19,6 +19,7 @@ from schemas.site import Site
 from services.common.geodesy import bridge_frame, heading_deg, to_chainage
 from services.viewer.crossing_view import VEHICLE_COLOURS, FloatArray
 from services.viewer.rerun_parts import (
+    LABEL,
     MUTED,
     UNKNOWN,
     IntArray,
@@ -168,7 +169,7 @@ def log_surroundings(
         f"{root}/scale",
         rr.LineStrips2D(
             [[(0.0, down), (length, down)]],
-            colors=[rgb(MUTED)],
+            colors=[rgb(LABEL)],
             radii=rr.Radius.ui_points(1.0),
             labels=[f"{length:g} m"],
             show_labels=True,
@@ -182,7 +183,7 @@ def log_surroundings(
         rr.Arrows2D(
             origins=[(0.93 * span, down)],
             vectors=[(reach * np.cos(north), -reach * np.sin(north))],
-            colors=[rgb(MUTED)],
+            colors=[rgb(LABEL)],
             radii=rr.Radius.ui_points(1.0),
             labels=["N"],
             show_labels=True,

@@ -127,7 +127,7 @@ def _add_one(
     of = f" of {', '.join(sorted(bridges))}" if bridges else ""
     before = f", {there} there already" if there else ""
     beside = f", {warm} with a temperature" if options.temperature is not None else ""
-    return f"{path}: {new} crossings{of} added{before}{beside}"
+    return f"{path}: {new} crossing{'' if new == 1 else 's'}{of} added{before}{beside}"
 
 
 def _table(options: HistoryOptions) -> int:

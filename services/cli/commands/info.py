@@ -175,7 +175,7 @@ def _lines_of_truck(truck: "TruckSummary") -> Iterator[str]:
     for name, stream in truck.streams.items():
         rate = f", {stream.rate_hz:.3g} a second" if stream.rate_hz is not None else ""
         missing = f", {stream.missing} missing" if stream.missing else ""
-        yield f"  {name}: {stream.messages} messages{rate}{missing}"
+        yield f"  {name}: {_count(stream.messages, 'message')}{rate}{missing}"
         if name == "accel" and truck.channel_rates_hz:
             rates = truck.channel_rates_hz
             if len(set(rates.values())) == 1:

@@ -12,6 +12,7 @@ from services.viewer.crossing_scene import CrossingScene, Panel
 from services.viewer.crossing_view import VEHICLE_COLOURS, FloatArray
 from services.viewer.rerun_parts import (
     BASELINE,
+    LABEL,
     MUTED,
     WEAK,
     RerunStream,
@@ -123,7 +124,8 @@ def _log_level(
     x = np.repeat(edges_m, 2)[1:-1] * STRIP_WIDTH / edges_m[-1]
     log_strips(recording, entity, [np.column_stack((x, np.repeat(rows, 2)))], [rgb(colour)], 0.75)
     beside, last = np.array([STRIP_WIDTH + 80.0]), rows[-1:] - 25.0  # it stands below its place
-    log_labels(recording, f"{entity}/name", [name], beside, last, colour=colour)
+    of_name = LABEL if colour == MUTED else colour
+    log_labels(recording, f"{entity}/name", [name], beside, last, colour=of_name)
 
 
 PANEL: Final = Panel(lambda scene: scene.crossing.rigidity_nm2, _layout, log_rigidity)

@@ -51,7 +51,9 @@ def test_arguments_behind_two_dashes_stay() -> None:
 
 
 def test_other_commands_keep_their_options() -> None:
-    with pytest.raises(InputError, match="unrecognized arguments: --limit"):
+    with pytest.raises(
+        InputError, match=r"unrecognized arguments: --limit \(see driveby view --help"
+    ):
         cli._parser().parse_args(["view", "a.mcap", "--limit"])
 
 

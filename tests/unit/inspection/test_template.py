@@ -144,7 +144,9 @@ def test_the_command_writes_it_and_spoils_nothing(
     assert cli.main(["check", str(new)]) == 2
     said = capsys.readouterr()
     lines = [line for line in said.out.splitlines() if line.startswith("  wrong  ")]
-    assert lines[0].startswith("  wrong  vehicle.total_mass_kg is NaN, it must be a mass in kg")
+    assert lines[0].startswith(
+        "  wrong  vehicle.total_mass_kg is NaN (not filled in), it must be a mass"
+    )
     assert said.err.endswith(f"{new}: {len(lines)} things are wrong; nothing else was checked\n")
     assert said.err.count("\n") == 1
     assert len(lines) == len(NEEDED.findall(TEMPLATE))

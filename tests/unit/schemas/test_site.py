@@ -241,7 +241,11 @@ def test_one_table_in_a_list_is_the_same_site() -> None:
             "-9530.0",
             "vehicle.total_mass_kg is -9530.0, it must be a mass greater than 0 kg",
         ),
-        ("total_mass_kg", "nan", "vehicle.total_mass_kg is NaN, it must be a mass in kg, a finite"),
+        (
+            "total_mass_kg",
+            "nan",
+            "vehicle.total_mass_kg is NaN (not filled in), it must be a mass in kg",
+        ),
         ("total_mass_kg", "inf", "vehicle.total_mass_kg is Infinity, it must be a mass in kg"),
         ("total_mass_kg", '"9 t"', 'vehicle.total_mass_kg is "9 t", it must be a mass in kg'),
         ("total_mass_kg", "true", "vehicle.total_mass_kg is true, it must be a mass in kg"),
