@@ -1,5 +1,6 @@
 """A truck that was out of radio until Zenoh has forgotten it: its spool has everything."""
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -10,9 +11,11 @@ from schemas.events import EventKind, decode_event
 from schemas.topics import Message
 from services.recordings.recording import read_messages
 from tests.faults.logger_process import FORGETFUL_ENV
-from tests.waiting import until
+from tests.waiting import LONGEST_S, until
 
 pytestmark = pytest.mark.process
+
+MINUTES_ENV = "DRIVEBY_SOAK_SILENCE_MINUTES"
 
 
 @pytest.mark.parametrize("reboots", [False, pytest.param(True, marks=pytest.mark.faults)])
@@ -21,11 +24,26 @@ def test_silent_truck_is_fetched_from_its_spool(fleet: Callable[..., Any], reboo
 
     Another truck has a link of its own all the time.
     """
-    one = fleet(router=True)
-    one.start_logger(**{FORGETFUL_ENV: "1"})
+    check_silence(fleet(router=True), {FORGETFUL_ENV: "1"}, rate=100.0, reboots=reboots)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(6 * 3600)
+def test_truck_silent_for_over_an_hour_is_fetched_from_its_spool(
+    fleet: Callable[..., Any],
+) -> None:
+    """The same with Zenoh as it is: it forgets a publisher after an hour of silence."""
+    minutes = float(os.environ.get(MINUTES_ENV, "70"))
+    check_silence(fleet(router=True), {}, rate=10.0, at_least_s=60.0 * minutes)
+
+
+def check_silence(
+    one: Any, env: dict[str, str], rate: float, *, at_least_s: float = 0.0, reboots: bool = False
+) -> None:
+    one.start_logger(**env)
     one.start_router()
-    silent = one.start_truck("truck-1", rate=100.0)
-    healthy = one.start_truck("truck-2", rate=100.0, endpoint=one.logger_endpoint)
+    silent = one.start_truck("truck-1", rate=rate)
+    healthy = one.start_truck("truck-2", rate=rate, endpoint=one.logger_endpoint)
     silent.wait_for(20)
     healthy.wait_for(20)
     until(lambda: "truck-1 in realm live connected" in one.said_by_logger(), "the truck")
@@ -34,10 +52,10 @@ def test_silent_truck_is_fetched_from_its_spool(fleet: Callable[..., Any], reboo
         lambda: "truck-1 in realm live disconnected" in one.said_by_logger(), "the end of its link"
     )
     (boot_id, cut_off_at), *_ = silent.said.items()
-    silent.wait_for(cut_off_at + 60)
+    silent.wait_for(cut_off_at + max(60, round(at_least_s * rate)), LONGEST_S + 2.0 * at_least_s)
     if reboots:
         silent.kill()
-        silent = one.start_truck("truck-1", rate=100.0)
+        silent = one.start_truck("truck-1", rate=rate)
         silent.wait_for(60)
     back_ns = time.time_ns()
     one.start_router()
