@@ -5,6 +5,7 @@ shows an object once its upload is complete. Nothing is ever changed in place.
 """
 
 import errno
+import logging
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -72,7 +73,16 @@ def folder_at(name: str) -> Folder:
         raise InputError(
             f"{name}: no store is known as {protocol}://, give a folder or s3://BUCKET/FOLDER"
         ) from None
+    logging.getLogger("asyncio").addFilter(_is_no_leftover)
     return Folder(name, files, str(root).rstrip("/"))
+
+
+def _is_no_leftover(record: logging.LogRecord) -> bool:
+    """Return whether a record is other than aiohttp's on each connection of a failed download.
+
+    The failure has a line of its own.
+    """
+    return not record.getMessage().startswith("Unclosed c")
 
 
 def check_folder(folder: Folder) -> None:
