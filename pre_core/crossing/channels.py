@@ -49,6 +49,13 @@ _DEGREE = 5
 """
 
 
+class GainsAndDelays(NamedTuple):
+    """Relative gain errors and delays in s of the four channels of k trucks, (k, 4) each."""
+
+    gain: FloatArray
+    delay_s: FloatArray
+
+
 class ModelSignals(NamedTuple):
     """Signals (4, 6, n) on an even grid that begins `start_s` after the first sample."""
 

@@ -79,17 +79,16 @@ def compliance_posterior(found: Optimum, inflation: float) -> CompliancePosterio
     centre, jacobian = to_compliance_coordinates(problem, state.y, state.jacobian[kept])
     precision = jacobian.T @ jacobian / inflation**2
     linear = precision @ centre - jacobian.T @ state.residual[kept] / inflation**2
-    return from_normal(
+    posterior = from_normal(
         precision,
         linear,
         where.elements,
         where.half_normal,
         rigidity_spread(problem.priors),
         log_odds_of_absence(problem, inflation),
-        inflation,
         centre[where.elements],
-        mismatch_bias(found),
     )
+    return posterior._replace(inflation=inflation, bias_direction=mismatch_bias(found))
 
 
 def without_priors(
@@ -130,16 +129,14 @@ def from_normal(
     cut_off: NDArray[np.int64],
     sigma: FloatArray,
     log_odds: FloatArray,
-    inflation: float,
     centre: FloatArray,
-    bias_direction: FloatArray,
 ) -> CompliancePosterior:
     """Return the posterior of a normal likelihood `precision` (f, f), `linear` (f,) and the priors.
 
     Coordinates `elements` (e,) are compliances c; `sigma` (e,) are the spreads of ln EI, `centre`
     (e,) the compliances at the optimum. Coordinates `cut_off` (k,) are truncated at zero.
-    `log_odds` (f,) are those of `posterior.log_odds_of_absence`, `bias_direction` (f,) is that of
-    `mismatch_bias`, and `inflation` the noise relative to the declared one.
+    `log_odds` (f,) are those of `posterior.log_odds_of_absence`. The noise is as declared, without
+    bias of the mismatch.
     """
     sampled = np.concatenate([elements, cut_off])
     others = np.setdiff1d(np.arange(linear.size), sampled)
@@ -149,13 +146,13 @@ def from_normal(
         sampled,
         others,
         centre,
-        inflation,
+        1.0,
         *marginal(precision, linear, sampled),
         log_odds[sampled],
         np.linalg.inv(cholesky(precision[np.ix_(others, others)], lower=True)),
         linear[others],
         precision[np.ix_(others, sampled)],
-        bias_direction,
+        np.zeros(linear.size),
     )
 
 

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.crossing import mismatch as _mismatch
+from pre_core.crossing.channels import GainsAndDelays
 from pre_core.crossing.mismatch import Mismatch
 from pre_core.crossing.rows import RESIDUALS, RowFilter, phases
 from pre_core.crossing.suspension_noise import (
@@ -285,21 +286,19 @@ def noise_power(
 def mismatch_power(
     rows: RowFilter,
     trucks: list[NoisePath],
-    gains: FloatArray,
-    delays_s: FloatArray,
+    channels: GainsAndDelays,
     density: FloatArray,
     force: FloatArray,
     road: Mismatch,
     wheelbase_m: float,
-    which: list[int],
 ) -> FloatArray:
-    """Return E[r' C_0^-1 (r_k - r)] per residual sample by the mismatch alone: (w,).
+    """Return E[r' C_0^-1 (r_k - r)] per residual sample by the mismatch alone: (trucks - 1,).
 
     The wheels respond to their own profiles, so that the mismatch is both in the residuals and in
     the accelerations: errors in variables, which would bias towards trucks that respond less to it.
-    With r the residuals of the first truck and r_k those of another (of channels with `gains` and
-    `delays_s`, (trucks, 4) each), E = M_k M_0^-1 - 1 describes how the latter mixes the input
-    profiles, which differ by d; the front is taken when it was at the rear's present place.
+    With r the residuals of the first truck and r_k those of another, each with its `channels`, E =
+    M_k M_0^-1 - 1 describes how the latter mixes the input profiles, which differ by d; the front
+    axle's residuals are taken when its wheel was at the rear's present place.
     """
     at = _folded(rows, _MANY_FREQUENCIES)
 
@@ -308,7 +307,7 @@ def mismatch_power(
         s = 1j * omega
 
         def estimation(k: int) -> NDArray[np.complex128]:
-            channel = (1.0 + gains[k])[:, None] * np.exp(np.outer(delays_s[k], s))
+            channel = (1.0 + channels.gain[k])[:, None] * np.exp(np.outer(channels.delay_s[k], s))
             return np.moveaxis(_estimation(trucks[k], omega) * channel, 2, 0)
 
         inverse = np.linalg.inv(estimation(0))
@@ -316,9 +315,9 @@ def mismatch_power(
         of_front = omega**4 * power * _mismatch.front_cross_spectrum(road, omega)
         of_rear = of_front - of_all  # rear profile with d
         turn = np.exp(s * wheelbase_m / road.speed_m_per_s)
-        out = np.empty((len(which), RESIDUALS, omega.size), dtype=np.complex128)
-        for number, k in enumerate(which):
-            e = np.moveaxis(estimation(1 + k) @ inverse, 0, 2) - np.eye(4)[:, :, None]
+        out = np.empty((len(trucks) - 1, RESIDUALS, omega.size), dtype=np.complex128)
+        for number in range(len(out)):
+            e = np.moveaxis(estimation(1 + number) @ inverse, 0, 2) - np.eye(4)[:, :, None]
             out[number, 0] = of_front * (e[0, 0] - turn * e[1, 0])
             out[number, 0] += of_rear * (turn.conj() * e[0, 1] - e[1, 1])
             out[number, 1] = of_front * e[2, 0] + of_rear * turn.conj() * e[2, 1]

@@ -7,7 +7,7 @@ import numpy as np
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import lines
-from pre_core.crossing.channels import A, channel_signals
+from pre_core.crossing.channels import A, GainsAndDelays, ModelSignals, channel_signals
 from pre_core.crossing.front_axle import without_front_axle
 from pre_core.crossing.mismatch import BridgePavement, Mismatch, mismatch_spectra
 from pre_core.crossing.noise import (
@@ -101,46 +101,25 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
     """
     model = channel_signals(inputs.acceleration_m_per_s2, inputs.step_s, inputs.slowest_rate_hz)
     n = model.signals.shape[2]
-    basis = beam_basis(
-        inputs.element_lengths_m,
-        inputs.parts,
-        interior_supports=inputs.interior_supports,
-        has_compliant_bearings=True,
-    )
     position, speeding, rows, values, best = trajectory_basis(
         inputs.fixes, inputs.start_s + model.start_s, model.step_s, n, inputs.direction, _KNOT_S
     )
     front = position @ best[:-1]
-    travel = front if inputs.direction > 0 else inputs.span_m - front
-    wheelbase = inputs.priors.wheelbase_m
-    first = int(np.searchsorted(travel - wheelbase, travel[0] + _MARGIN_M))
-    crossing = GriddedCrossing(
-        model.step_s,
-        model.signals,
-        inputs.direction,
-        inputs.span_m,
-        inputs.total_mass_kg,
-        inputs.cg_height_m,
-        STANDARD_GRAVITY_M_PER_S2,
-        change_basis(basis, inputs.priors.theta),
-        np.concatenate([[0.0], np.cumsum(basis.lengths_m)]),
-        first,
-        n - first,
-        sinc_table(),
-        step_table(),
-        False,
-        0,
-        _torsion(inputs, basis.lengths_m),
-    )
-    crossing = crossing._replace(lead=inputs.lead, lead_acceleration=np.zeros(n))
-    crossing = crossing._replace(swing_sample=swing_sample(crossing, front))
+    crossing = _gridded(inputs, model, front)
     row = row_filter(model.step_s)
     theta = inputs.priors.theta
     speed = float(np.ptp(front)) / ((n - 1) * model.step_s)
     noise = whitener(
         row,
         row_count(row, crossing.rows),
-        noise_path(theta, crossing.total_mass_kg, wheelbase, False, crossing.lead, speed),
+        noise_path(
+            theta,
+            crossing.total_mass_kg,
+            inputs.priors.wheelbase_m,
+            False,
+            crossing.lead,
+            speed,
+        ),
         inputs.density_m_per_s2_per_rthz,
         no_suspension_noise(),
     )
@@ -166,6 +145,43 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
         ),
     )
     return problem, starting_point(problem, best)
+
+
+def _gridded(inputs: CrossingInputs, model: ModelSignals, front_m: FloatArray) -> GriddedCrossing:
+    """Return the crossing on the grid of `model`, with the front axle at chainages `front_m` (n,).
+
+    Residuals begin where the rear axle has passed the chainage at which the front axle begins.
+    """
+    n = front_m.size
+    basis = beam_basis(
+        inputs.element_lengths_m,
+        inputs.parts,
+        interior_supports=inputs.interior_supports,
+        has_compliant_bearings=True,
+    )
+    travel = front_m if inputs.direction > 0 else inputs.span_m - front_m
+    first = int(np.searchsorted(travel - inputs.priors.wheelbase_m, travel[0] + _MARGIN_M))
+    crossing = GriddedCrossing(
+        model.step_s,
+        model.signals,
+        inputs.direction,
+        inputs.span_m,
+        inputs.total_mass_kg,
+        inputs.cg_height_m,
+        STANDARD_GRAVITY_M_PER_S2,
+        change_basis(basis, inputs.priors.theta),
+        np.concatenate([[0.0], np.cumsum(basis.lengths_m)]),
+        first,
+        n - first,
+        sinc_table(),
+        step_table(),
+        False,
+        0,
+        _torsion(inputs, basis.lengths_m),
+        inputs.lead,
+        np.zeros(n),
+    )
+    return crossing._replace(swing_sample=swing_sample(crossing, front_m))
 
 
 def _torsion(inputs: CrossingInputs, lengths_m: FloatArray) -> TorsionBasis:
@@ -381,19 +397,19 @@ def mismatch_gradient(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
         *range(where.wheelbase, where.gains.stop),
         *range(where.delays.start, where.delays.stop),
     ]
+    some = [0, *(1 + k for k in changing)]
+    channels = GainsAndDelays(at.gain[some], at.delay_s[some])
     slope = np.zeros(where.delays.stop)
     count = row_count(problem.rows, problem.crossing.rows)
     for part, number in parts_of(problem.mismatch, count):
         power = mismatch_power(
             problem.rows,
-            trucks,
-            at.gain,
-            at.delay_s,
+            [trucks[k] for k in some],
+            channels,
             problem.density * (1.0 + at.gain[0]),
             REDUCED_WEIGHT_FACTOR * problem.force,
             part,
             float(at.wheelbase_m[0]),
-            changing,
         )
         slope[changing] += number * power / _SLOPE_STEP
     return slope

@@ -137,10 +137,8 @@ def draw(
         coords.half_normal,
         coords.sigma,
         coords.log_odds,
-        coords.inflation,
         centre[coords.curved],
-        np.zeros(surrogate.linear.size),
-    )
+    )._replace(inflation=coords.inflation)
     first = number * CHAINS
     return np.concatenate(
         [compliances.draws(density, count // CHAINS, seed, first + k) for k in range(CHAINS)]

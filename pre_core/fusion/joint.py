@@ -328,7 +328,5 @@ def _posterior(
         np.flatnonzero(~of.is_log),
         of.scale[layout.elements],
         priors.log_odds,
-        1.0,
         information.centre[layout.elements],
-        np.zeros(layout.bridge),
     )

@@ -27,6 +27,7 @@ from pre_core.monitoring.baseline import (
 )
 from pre_core.monitoring.chart import (
     MAX_STANDARDISED,
+    Chart,
     ChartVerdict,
     chart_verdict,
     empty_chart,
@@ -191,9 +192,7 @@ def detect_change(
                 wider = innovation._replace(covariance=inflation * innovation.covariance)
                 state, weight = update_state(state, wider)
                 chart = skip_period(chart, kept, drift, weight, innovation)
-            likely = state.log_weight > np.log(_UNLIKELY)
-            if likely.mean() < _WORTHWHILE:
-                state, chart = select_scales(state, likely), select_chart_scales(chart, likely)
+            state, chart = _without_unlikely_scales(state, chart)
             stay = {*chart.begins, *kept_for}
             before = {begin_at: one for begin_at, one in before.items() if begin_at in stay}
         else:  # an alarm stands: later periods estimate its size and nothing else
@@ -206,12 +205,23 @@ def detect_change(
                 state = adopt_change(standing)
             found, chart = None, empty_chart(state)
     if found is not None:
-        mean, covariance = change_of(standing)
-        half = NORMAL_975 * np.sqrt(np.diag(covariance))
-        found = found._replace(
-            ratio=np.exp(mean), low=np.exp(mean - half), high=np.exp(mean + half)
-        )
+        found = _with_interval(found, standing)
     return MonitoringResult(rows, is_judged, statistic, threshold, *_usual(state), found)
+
+
+def _with_interval(change: Change, standing: BaselineState) -> Change:
+    """Return a change with the ratios that a filter with the change in its state estimates."""
+    mean, covariance = change_of(standing)
+    half = NORMAL_975 * np.sqrt(np.diag(covariance))
+    return change._replace(ratio=np.exp(mean), low=np.exp(mean - half), high=np.exp(mean + half))
+
+
+def _without_unlikely_scales(state: BaselineState, chart: Chart) -> tuple[BaselineState, Chart]:
+    """Return state and chart of the likely scales, if dropping the others saves enough."""
+    likely = state.log_weight > np.log(_UNLIKELY)
+    if likely.mean() < _WORTHWHILE:
+        return select_scales(state, likely), select_chart_scales(chart, likely)
+    return state, chart
 
 
 def compare_periods(first: Period, last: Period) -> PeriodDifference:

@@ -313,6 +313,14 @@ def _wheels(
 
 
 @kernel
+def _all_beyond(values: tuple[float, float, float, float], limit: FloatArray) -> bool:
+    beyond = True
+    for lane in range(LANES):
+        beyond = beyond and values[lane] > limit[lane]
+    return beyond
+
+
+@kernel
 def march_four(
     window: PaperWindow, work: Workspace, theta: FloatArray, limit: FloatArray, total: FloatArray
 ) -> None:
@@ -328,13 +336,7 @@ def march_four(
                 return
     basis = window.basis
     if not modal_filters(
-        basis,
-        theta,
-        window.step_s,
-        work.matrix,
-        work.vectors,
-        work.cubics,
-        work.feedback,
+        basis, theta, window.step_s, work.matrix, work.vectors, work.cubics, work.feedback
     ):
         return
     factors = np.empty((13, LANES))
@@ -361,13 +363,7 @@ def march_four(
             for q in range(columns):
                 seen = fma_scalar(r, window.nuisance[row, q], load(work.seen, q))
                 store(work.seen, q, seen)
-        if (
-            columns == 0
-            and squares[0] > limit[0]
-            and squares[1] > limit[1]
-            and squares[2] > limit[2]
-            and squares[3] > limit[3]
-        ):
+        if columns == 0 and _all_beyond(squares, limit):
             break
     for q in range(columns):
         seen = load(work.seen, q)

@@ -24,16 +24,14 @@ class Response(NamedTuple):
 
 @compiled()
 def _march(
-    mass: FloatArray,
     damping: FloatArray,
     stiffness: FloatArray,
     inverse: FloatArray,
     force: FloatArray,
     step_s: float,
-    u: FloatArray,
-    v: FloatArray,
-    a: FloatArray,
+    response: Response,
 ) -> None:
+    u, v, a = response
     for n in range(1, force.shape[0]):
         u_guess = u[n - 1] + step_s * v[n - 1] + 0.25 * step_s**2 * a[n - 1]
         v_guess = v[n - 1] + 0.5 * step_s * a[n - 1]
@@ -67,8 +65,9 @@ def newmark(
     a[0] = np.linalg.solve(mass, force[0] - damping @ v[0] - stiffness @ u[0])
     effective = mass + 0.5 * step_s * damping + 0.25 * step_s**2 * stiffness
     inverse = np.asarray(np.linalg.inv(effective), dtype=np.float64)
-    _march(mass, damping, stiffness, inverse, force, step_s, u, v, a)
-    return Response(u, v, a)
+    response = Response(u, v, a)
+    _march(damping, stiffness, inverse, force, step_s, response)
+    return response
 
 
 @compiled()

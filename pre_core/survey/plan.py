@@ -178,9 +178,7 @@ def survey_spreads(
         known.half_normal,
         known.sigma,
         known.log_odds,
-        1.0,
         truth[elements],
-        np.zeros(b),
     )
     drawn = np.concatenate([draws(of, _DRAWS, seed, chain) for chain in range(_CHAINS)])
     ln_ei = drawn[:, elements] * known.sigma

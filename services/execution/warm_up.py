@@ -65,7 +65,7 @@ def _warm_up_fusing() -> None:
     """Run the sampler of a bridge of one element, without supports that might be absent."""
     one, nowhere = np.ones(1), np.zeros(0, dtype=np.int64)
     density = from_normal(
-        np.eye(2), np.ones(2), np.ones(1, dtype=np.int64), nowhere, one, np.zeros(2), 1.0, one, one
+        np.eye(2), np.ones(2), np.ones(1, dtype=np.int64), nowhere, one, np.zeros(2), one
     )
     draws(density, 1, 0, 0)
 

@@ -7,7 +7,7 @@ and judges the answer. Every failure is a verdict, not an exception. No I/O, no 
 import logging
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from pydantic import ValidationError
@@ -26,9 +26,10 @@ from services.finding.streams import Samples
 from services.identification.methods import METHODS, IdentificationMethod
 from services.identification.paper_method import identify_paper
 from services.identification.pre_method import Keep as Keep
-from services.identification.pre_method import identify_pre
+from services.identification.pre_method import MethodRun, identify_pre
 from services.identification.result_parts import (
     CrossingTimes,
+    Cut,
     Floats,
     longest_outage_s,
     rejected,
@@ -101,9 +102,8 @@ def identify(
             return reject(broken, broken)
         cut = cut._replace(acceleration=middle_of(data.vehicle, cut.acceleration))
         if method.has_noise_model:
-            return identify_pre(
-                data, settings, passing, *cut, report, lambda: stopwatch() - began, keep
-            )
+            run = MethodRun(report, lambda: stopwatch() - began, keep)
+            return identify_pre(data, settings, passing, cut, run)
         return identify_paper(
             data,
             settings,
@@ -133,18 +133,9 @@ def is_not_finite(error: Exception) -> bool:
     return isinstance(error, ArithmeticError)
 
 
-class _Cut(NamedTuple):
-    """Samples of a crossing, with the truck's positions at them."""
-
-    acceleration: Floats
-    """Accelerations (m, n) of the vehicle's channels, in its order; (4, n) once reduced."""
-    start_s: float
-    motion: Motion
-
-
 def _cut(
     data: CrossingData, trajectory: Trajectory, samples: Samples, passing: CrossingTimes
-) -> _Cut | None:
+) -> Cut | None:
     """Return the unbroken samples around the crossing; None if some are missing in it."""
     time_s = samples.start_s + np.arange(_size(samples)) / samples.rate_hz
     part = _covered(samples, time_s, passing.entry_s, passing.exit_s)
@@ -152,14 +143,14 @@ def _cut(
         return None
     motion = motion_at(trajectory, time_s[part], data.stay.direction)
     driving = _driving(time_s[part], motion, passing)
-    return _Cut(
+    return Cut(
         np.stack([samples.channels[name][part][driving] for name in data.vehicle.channels]),
         float(time_s[part][driving][0]),
         Motion(*(values[driving] for values in motion)),
     )
 
 
-def _near(cut: _Cut, passing: CrossingTimes, step_s: float) -> slice:
+def _near(cut: Cut, passing: CrossingTimes, step_s: float) -> slice:
     """Return the samples of the crossing itself, for which the thresholds were determined."""
     time_s = cut.start_s + step_s * np.arange(cut.acceleration.shape[1])
     edges = (passing.entry_s - _JUDGED_ASIDE_S, passing.exit_s + _JUDGED_ASIDE_S)

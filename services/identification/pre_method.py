@@ -6,7 +6,8 @@ converts a site file into priors, draws into parameters, and diagnostics into a 
 """
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,6 @@ from pre_core.crossing.preparation import CrossingInputs, lines_hz
 from pre_core.crossing.sampling import PosteriorDraws, sample
 from pre_core.physics.beam_basis import first_frequencies_hz
 from pre_core.physics.models import body_masses
-from pre_core.physics.simulate import Motion
 from pre_core.search.loop import Report, Termination
 from schemas import results
 from schemas.reasons import Reason, texts
@@ -35,6 +35,7 @@ from services.identification.fusing import stored
 from services.identification.lane import lane_factor
 from services.identification.result_parts import (
     CrossingTimes,
+    Cut,
     Floats,
     caveats,
     detrended,
@@ -76,6 +77,15 @@ _FREQUENCY_DRAWS = 1000
 Keep = Callable[[str, dict[str, Floats]], None]
 """Receiver of the draws of a crossing: its identifier and, by name, each unknown's (chains,
 draws)."""
+
+
+class MethodRun(NamedTuple):
+    """Callbacks of a run of a method."""
+
+    report: Report
+    elapsed: Callable[[], float]
+    """Time in s since the identification began."""
+    keep: Keep
 
 
 def inputs_of(
@@ -186,68 +196,42 @@ def identify_pre(
     data: CrossingData,
     settings: IdentificationSettings,
     passing: CrossingTimes,
-    acceleration: Floats,
-    start_s: float,
-    motion: Motion,
-    report: Report,
-    elapsed: Callable[[], float],
-    keep: Keep,
+    cut: Cut,
+    run: MethodRun,
 ) -> results.CrossingResult:
     """Return the posterior of one crossing as a result; a fit that explains nothing is rejected."""
-    inputs = inputs_of(data, settings, acceleration, start_s)
-    found = optimum.find_optimum(inputs, report)
+    inputs = inputs_of(data, settings, cut.acceleration, cut.start_s)
+    found = optimum.find_optimum(inputs, run.report)
+    reject = partial(rejected, data, settings, passing)
     if found.noise_power > optimum.HOPELESS_NOISE:
-        return rejected(
-            data,
-            settings,
-            passing,
+        counted = {"iterations": float(found.evaluations), "starts": float(found.starts)}
+        return reject(
             [Reason.NOISE_ABOVE_DECLARED],
             chi2_per_dof=found.noise_power,
-            diagnostics={
-                "iterations": float(found.evaluations),
-                "starts": float(found.starts),
-                "seconds": elapsed(),
-            },
+            diagnostics=counted | {"seconds": run.elapsed()},
         )
     if found.ending is Termination.NOT_FINITE:
-        named = undeclared_axles(data.vehicle, acceleration, inputs.step_s, is_doubted=True)
-        return rejected(data, settings, passing, [Reason.NOT_FINITE, *named], named)
-    problem = found.problem
+        named = undeclared_axles(data.vehicle, cut.acceleration, inputs.step_s, is_doubted=True)
+        return reject([Reason.NOT_FINITE, *named], named)
     diagnostics = _diagnostics_of_search(found)
-    against = reasons_of_fit(data, found, acceleration, inputs.step_s)
+    against = reasons_of_fit(data, found, cut.acceleration, inputs.step_s)
     reasons, about = list(against.reasons), against.about
     usable = _LARGEST_CHI2 if Reason.NOISE_ABOVE_DECLARED in reasons else _USABLE_CHI2
     # Away from the optimum neither values nor widths have a meaning.
     if against.forbids or found.ending is not Termination.CONVERGED or found.chi2_per_dof > usable:
-        diagnostics["seconds"] = elapsed()
-        return rejected(
-            data,
-            settings,
-            passing,
-            reasons,
-            about,
-            chi2_per_dof=found.chi2_per_dof,
-            diagnostics=diagnostics,
-        )
+        diagnostics["seconds"] = run.elapsed()
+        return reject(reasons, about, chi2_per_dof=found.chi2_per_dof, diagnostics=diagnostics)
     inflation = float(np.sqrt(max(1.0, found.chi2_per_dof)))
-    chain = sample(found, settings.draws, settings.seed, inflation=inflation, report=report)
-    diagnostics |= {
-        "r_hat": chain.r_hat,
-        "ess": chain.ess,
-        "acceptance": chain.acceptance,
-        "draws": float(chain.draws.shape[0] * chain.draws.shape[1]),
-        "chain_evaluations": float(chain.evaluations),
-    }
-    if chain.pareto_k is not None:
-        diagnostics["pareto_k"] = chain.pareto_k
+    chain = sample(found, settings.draws, settings.seed, inflation=inflation, report=run.report)
+    diagnostics |= _diagnostics_of_draws(chain)
     if chain.ending is not Termination.STEPS_DONE:
         reasons.append(Reason.SAMPLER_DIAGNOSTICS)
-    implausible = _implausible_elements(data.bridge, problem, chain)
+    implausible = _implausible_elements(data.bridge, found.problem, chain)
     if implausible:
         reasons.append(Reason.IMPLAUSIBLE_BRIDGE)
-    reasons += caveats(data, motion)
-    values = _values(data, problem, chain, settings, keep)
-    diagnostics["seconds"] = elapsed()
+    reasons += caveats(data, cut.motion)
+    values = _values(data, found.problem, chain, settings, run.keep)
+    diagnostics["seconds"] = run.elapsed()
     once = tuple(dict.fromkeys(reasons))
     return results.CrossingResult(
         **header(data, settings, passing),
@@ -269,6 +253,19 @@ def _diagnostics_of_search(found: Optimum) -> dict[str, float]:
         "position_shift_m": float(shift_m),
         **dict(zip(results.HUM, lines_hz(found.problem), strict=False)),
     }
+
+
+def _diagnostics_of_draws(chain: PosteriorDraws) -> dict[str, float]:
+    diagnostics = {
+        "r_hat": chain.r_hat,
+        "ess": chain.ess,
+        "acceptance": chain.acceptance,
+        "draws": float(chain.draws.shape[0] * chain.draws.shape[1]),
+        "chain_evaluations": float(chain.evaluations),
+    }
+    if chain.pareto_k is not None:
+        diagnostics["pareto_k"] = chain.pareto_k
+    return diagnostics
 
 
 def _implausible_elements(

@@ -35,6 +35,15 @@ class CrossingTimes(NamedTuple):
     speed_m_per_s: float
 
 
+class Cut(NamedTuple):
+    """Samples of a crossing, with the truck's positions at them."""
+
+    acceleration: Floats
+    """Accelerations (m, n) of the vehicle's channels, in its order; (4, n) once reduced."""
+    start_s: float
+    motion: Motion
+
+
 def part_of_elements(lengths_m: Floats, begin: float, end: float) -> Floats:
     """Return the shares (n,), of sum one, of elements between two fractions of the length."""
     edges = np.concatenate([[0.0], np.cumsum(lengths_m)])

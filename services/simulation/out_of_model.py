@@ -105,12 +105,7 @@ def draw_out_of_model(site: Site, effect: str, seed: int) -> OutOfModelTruth:
     springs = rng.uniform(*SPRUNG_EI_PER_SPAN, 2)
     softest, hardest = BEARINGS_N_PER_M
     bearings = softest * (hardest / softest) ** rng.uniform(size=2)
-    way = 1.0 if rng.uniform() < 0.5 else -1.0
-    left = DepartedVehicle(
-        float(rng.uniform(*LORRY_KG) * STANDARD_GRAVITY_M_PER_S2),
-        float(way * rng.uniform(*LORRY_M_PER_S)),
-        float(rng.uniform(*LEFT_S)),
-    )
+    left = _draw_departed(rng)
     tyres = rng.uniform(*TYRE_DAMPING_NS_PER_M, 2)
     share, length = float(rng.uniform(*FRICTION_SHARE)), float(rng.uniform(*FRICTION_LENGTH_M))
     quiet, loud = BODY_NOISE_UG
@@ -134,10 +129,10 @@ def draw_out_of_model(site: Site, effect: str, seed: int) -> OutOfModelTruth:
     if effect in (TORSION, LEFT_AND_RIGHT):
         site = with_single_tyres(site)
     drawn = draw_truth(site, seed)
-    scale = site.bridges[0].support_rotational_stiffness_nm_per_rad_scale_at_zero
     sprung = [has("sprung") and (alone or bool(other)) for other in every_other[1:3]]
+    springs *= site.bridges[0].support_rotational_stiffness_nm_per_rad_scale_at_zero
     beyond = OutOfModelEffects(
-        _pair(springs * scale * sprung),
+        _pair(springs * sprung),
         _pair(1.0 / bearings if has("sinking") else np.zeros(2)),
         left if has("swing") else None,
         share if has("friction") else 0.0,
@@ -159,20 +154,33 @@ def draw_out_of_model(site: Site, effect: str, seed: int) -> OutOfModelTruth:
     if has(TORSION) or has(LEFT_AND_RIGHT):
         width = Width(_paths(site, rear_offset, PLAIN))
     if width is not None and has(TORSION):
-        nominal = np.mean(site.bridges[0].nominal_flexural_rigidity_nm2)
-        undamaged = beam._replace(
-            flexural_rigidity_nm2=np.full_like(beam.flexural_rigidity_nm2, nominal)
-        )
-        f_1 = float(natural_frequencies_hz(undamaged, 1)[0])
-        width = width._replace(lane_offset_m=lane, torsion=Torsion(ratio * f_1, gyration))
+        torsion = Torsion(ratio * _undamaged_frequency_hz(site, beam), gyration)
+        width = width._replace(lane_offset_m=lane, torsion=torsion)
     if width is not None and has(LEFT_AND_RIGHT):
-        width = width._replace(
-            load_left_m=load_left, sensors=_pairs(site, drawn, car, errors_of_pairs)
-        )
+        sensors = _pairs(site, drawn, car, errors_of_pairs)
+        width = width._replace(load_left_m=load_left, sensors=sensors)
     truth = drawn._replace(
         car=car, beam=beam, conditions=conditions, left=beyond.left, paths=paths, width=width
     )
     return OutOfModelTruth(truth, site, beyond)
+
+
+def _draw_departed(rng: np.random.Generator) -> DepartedVehicle:
+    way = 1.0 if rng.uniform() < 0.5 else -1.0
+    return DepartedVehicle(
+        float(rng.uniform(*LORRY_KG) * STANDARD_GRAVITY_M_PER_S2),
+        float(way * rng.uniform(*LORRY_M_PER_S)),
+        float(rng.uniform(*LEFT_S)),
+    )
+
+
+def _undamaged_frequency_hz(site: Site, beam: Beam) -> float:
+    """Return the first natural frequency of a beam with the nominal EI."""
+    nominal = np.mean(site.bridges[0].nominal_flexural_rigidity_nm2)
+    undamaged = beam._replace(
+        flexural_rigidity_nm2=np.full_like(beam.flexural_rigidity_nm2, nominal)
+    )
+    return float(natural_frequencies_hz(undamaged, 1)[0])
 
 
 def _draw_pavement(rng: np.random.Generator) -> Pavement:

@@ -82,19 +82,7 @@ def density_constant_m2(road_class: str) -> float:
 
 def heights_m(waves: Waves, strip: Strip, start_m: float, spacing_m: float, count: int) -> Floats:
     """Return the mean heights (count,) of the surface under a tyre at equally spaced chainages."""
-    return np.asarray(
-        _heights(
-            waves.n_x,
-            waves.n_y,
-            waves.amplitude,
-            strip.lateral_m,
-            strip.width_m,
-            strip.length_m,
-            start_m,
-            spacing_m,
-            count,
-        )
-    )
+    return np.asarray(_heights(waves, strip, start_m, spacing_m, count))
 
 
 @compiled()
@@ -104,17 +92,9 @@ def _sinc(x: float) -> float:
 
 
 @compiled()
-def _heights(
-    n_x: Floats,
-    n_y: Floats,
-    amplitude: Complexes,
-    lateral: float,
-    width: float,
-    length: float,
-    start: float,
-    spacing: float,
-    count: int,
-) -> Floats:
+def _heights(waves: Waves, strip: Strip, start: float, spacing: float, count: int) -> Floats:
+    n_x, n_y, amplitude = waves.n_x, waves.n_y, waves.amplitude
+    lateral, width, length = strip.lateral_m, strip.width_m, strip.length_m
     out = np.zeros(count)
     two_pi = 2.0 * np.pi
     for j in range(n_x.size):

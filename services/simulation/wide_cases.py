@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from schemas.wgs84 import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
@@ -78,19 +79,8 @@ def draw_wide(
     truck = two_axle_truck(
         float(u(*TOTAL_MASS_KG)), float(u(*WHEELBASE_M)), float(u(*FRONT_SHARE)), tyres, rng
     )
-    span = round(float(u(*SPAN_M)), 1)
-    elements = 5 if span < 24.0 else 7
-    mass = 4400.0 * float(np.sqrt(span / 30.0) * u(0.8, 1.25))
-    rigidity = mass * (2.0 * float(u(90.0, 115.0)) * span / np.pi) ** 2
-    ratios = np.ones(elements)
-    is_weak, element, weak = u() < 0.5, int(rng.integers(elements)), u(*WEAK)
-    if is_weak:
-        ratios[element] = weak
-    alpha, beta = (
-        0.7 * np.exp(0.2 * rng.standard_normal()),
-        0.005 * np.exp(0.2 * rng.standard_normal()),
-    )
-    plain = Deck(span, (float(rigidity),) * elements, mass, float(alpha), float(beta))
+    plain, ratios = _draw_beam(rng)
+    rigidity = plain.flexural_rigidity_nm2[0]
     f_1 = float(bending_frequencies_hz(plain, 1)[0])
     ratio, gyration = float(u(*TORSIONAL_RATIO)), float(u(*GYRATION_M))
     side = 1.0 if u() < 0.5 else -1.0
@@ -110,28 +100,49 @@ def draw_wide(
         seed,
         truck,
         deck,
-        float(rigidity),
+        rigidity,
         lane,
         str(rng.choice(["A", "B"])),
         int(rng.integers(1 << 31)),
         False,
         with_errors(middle_sensors(truck.axles[1].position_m, noise), rng),
-        tuple(
-            WideRun(
-                float(u(*SPEED_M_PER_S)),
-                bool(u() < 0.5),
-                WANDER_M * float(rng.standard_normal()),
-                float(u(0.1, 0.6)) if u() < 0.3 else 0.02,
-                float(u(8.0, 16.0)),
-            )
-            for _ in range(runs)
-        ),
+        tuple(_draw_run(rng) for _ in range(runs)),
         {
             "vehicle": declared_vehicle(truck, truck.total_mass_kg, rng),
-            "bridge": declared_bridge(deck, float(rigidity), rng) | (width if declared else {}),
+            "bridge": declared_bridge(deck, rigidity, rng) | (width if declared else {}),
             "sensor": {"rate_hz": 500.0, "noise_density_ug_per_rthz": noise},
         },
         receiver=receiver,
+    )
+
+
+def _draw_beam(rng: np.random.Generator) -> tuple[Deck, NDArray[np.float64]]:
+    """Draw an undamaged deck that does not twist, and the ratios (n,) of the damaged EI to it."""
+    u = rng.uniform
+    span = round(float(u(*SPAN_M)), 1)
+    elements = 5 if span < 24.0 else 7
+    mass = 4400.0 * float(np.sqrt(span / 30.0) * u(0.8, 1.25))
+    rigidity = mass * (2.0 * float(u(90.0, 115.0)) * span / np.pi) ** 2
+    ratios = np.ones(elements)
+    is_weak, element, weak = u() < 0.5, int(rng.integers(elements)), u(*WEAK)
+    if is_weak:
+        ratios[element] = weak
+    alpha, beta = (
+        0.7 * np.exp(0.2 * rng.standard_normal()),
+        0.005 * np.exp(0.2 * rng.standard_normal()),
+    )
+    deck = Deck(span, (float(rigidity),) * elements, mass, float(alpha), float(beta))
+    return deck, ratios
+
+
+def _draw_run(rng: np.random.Generator) -> WideRun:
+    u = rng.uniform
+    return WideRun(
+        float(u(*SPEED_M_PER_S)),
+        bool(u() < 0.5),
+        WANDER_M * float(rng.standard_normal()),
+        float(u(0.1, 0.6)) if u() < 0.3 else 0.02,
+        float(u(8.0, 16.0)),
     )
 
 

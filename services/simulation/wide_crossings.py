@@ -195,12 +195,12 @@ def road_under(
     lane_offset_m: float = 0.0,
     forward: bool = True,
     is_one_road: bool = False,
-    spacing_m: float = _ROAD_SPACING_M,
 ) -> WideRoad:
     """Return the profile under each tyre of a truck on an eccentric lane.
 
     With one road every tyre follows the same line, averaged over the first axle's contact length.
     """
+    spacing_m = _ROAD_SPACING_M
     count = round((stop_m - start_m) / spacing_m) + 1
     sign = 1.0 if forward else -1.0
     strips = []

@@ -30,7 +30,7 @@ OFTEN = frozenset({"State", "Info", "Problem"})
 
 LONG_MODULES = {
     "pre_core.crossing.residuals": 742,
-    "pre_core.paper.residual": 571,
+    "pre_core.paper.residual": 567,
 }
 
 LONG_CLASSES = {
@@ -38,29 +38,19 @@ LONG_CLASSES = {
 }
 
 LONG_FUNCTIONS = {
-    "pre_core.crossing.preparation:build_problem": 72,
-    "pre_core.monitoring.change_detection:detect_change": 71,
+    "pre_core.monitoring.change_detection:detect_change": 65,
     "pre_core.paper.residual:build_window": 87,
-    "pre_core.paper.residual:march_four": 62,
     "pre_core.physics.march:march": 140,
-    "services.identification.pre_method:identify_pre": 77,
-    "services.simulation.wide_cases:draw_wide": 78,
-    "services.simulation.out_of_model:draw_out_of_model": 78,
+    "services.simulation.out_of_model:draw_out_of_model": 68,
 }
 
 MANY_ARGUMENTS = {
-    "pre_core.crossing.compliances:from_normal": 9,
-    "pre_core.crossing.noise:mismatch_power": 9,
     "pre_core.paper.residual:build_window": 15,
-    "pre_core.physics.newmark:_march": 9,
     "pre_core.physics.simulate:simulate": 11,
     "services.identification.engine:Engine.__init__": 8,
-    "services.identification.pre_method:identify_pre": 9,
     "services.notebook.simulate:simulate": 10,
     "services.recordings.writer:RecordingWriter.__init__": 9,
     "services.simulation.drive:simulate_drive": 12,
-    "services.simulation.two_sided_surface:_heights": 9,
-    "services.simulation.wide_crossings:road_under": 8,
 }
 
 ROOMS_WITH_CODE = {

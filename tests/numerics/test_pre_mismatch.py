@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pre_core.crossing import mismatch as mm
+from pre_core.crossing.channels import GainsAndDelays
 from pre_core.crossing.compliances import CompliancePosterior, draws
 from pre_core.crossing.noise import (
     NoisePath,
@@ -167,9 +168,14 @@ def test_pull_of_the_mismatch_against_drawn_spectra(unknown: int) -> None:
     right, wrong = truck(), truck(unknown, 0.01)
     wheelbase = paper_site().vehicles[0].wheelbase_m
     expected_power = mismatch_power(
-        rows, [right, wrong], np.zeros((2, 4)), np.zeros((2, 4)), QUIET, no_suspension_noise(),
-        road, wheelbase, [0],
-    )[0]  # fmt: skip
+        rows,
+        [right, wrong],
+        GainsAndDelays(np.zeros((2, 4)), np.zeros((2, 4))),
+        QUIET,
+        no_suspension_noise(),
+        road,
+        wheelbase,
+    )[0]
     omega = _folded(rows, 4000).below
     n = omega / (2.0 * np.pi * SPEED)
     at = surface_density("A")
