@@ -59,8 +59,10 @@ class Reason(StrEnum):
 
 REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.CHANNEL_MISSING: "The truck lacks one of the four accelerometers that the method needs.",
-    Reason.GAP_ON_BRIDGE: "Samples are missing while the truck was on the bridge.",
-    Reason.POSITION_OUTAGE: "The receiver reported no position while the truck was on the bridge.",
+    Reason.GAP_ON_BRIDGE: "Samples are missing from the time on the bridge.",
+    Reason.POSITION_OUTAGE: (
+        "The receiver reported no position for more than 1.5 s near the bridge."
+    ),
     Reason.NOT_FINITE: "The recording or the fit contains values that are not finite numbers.",
     Reason.SENSOR_SATURATED: "An accelerometer reached the end of its range.",
     Reason.CHANNEL_SWAPPED: "Two channels seem to be swapped.",
@@ -77,8 +79,8 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
         "its heave."
     ),
     Reason.SENSORS_DISAGREE: (
-        "Accelerometers of one part of the truck do not agree: a gain or a delay is wrong, or one "
-        "is loose."
+        "Accelerometers of one part of the truck do not agree: a gain or delay is wrong, or a "
+        "sensor is loose."
     ),
     Reason.INCOMPLETE_CROSSING: "The recording begins or ends while the truck is on the bridge.",
     Reason.VEHICLE_DIFFERS_FROM_SITE: (
@@ -179,7 +181,7 @@ LEFT_OUT_TEXTS: Final[dict[str, str]] = {
     LeftOutReason.SUSPECT: "suspect",
     LeftOutReason.DISAGREES: "disagrees with the others beyond its uncertainty",
     LeftOutReason.OTHER_MODEL: "was identified with other elements or parameters",
-    LeftOutReason.NO_LIKELIHOOD: "an older result without the data that fusion needs",
+    LeftOutReason.NO_LIKELIHOOD: "is an older result without the data that fusion needs",
     LeftOutReason.NOT_FUSED: "this method's results are not fused",
 }
 

@@ -71,8 +71,8 @@ def tandem_of(axles: Sequence[Axle], bogies: Sequence[Bogie]) -> Tandem:
     if max(share, 1.0 - share) > _LARGEST_UNEVENNESS:
         raise error_at(
             "bogies.0.shares",
-            f"give one axle {max(share, 1.0 - share):.0%} of the force, it must be at most "
-            f"{_LARGEST_UNEVENNESS:.0%}",
+            f"give one axle {100.0 * max(share, 1.0 - share):.0f} % of the force, "
+            f"it must be at most {100.0 * _LARGEST_UNEVENNESS:.0f} %",
         )
     return Tandem(lead, first, second, share, bogie.share_spread)
 
@@ -97,8 +97,8 @@ def _static_share(first: Axle, second: Axle) -> tuple[float, float]:
     if max(share, 1.0 - share) > _LARGEST_UNEVENNESS:
         raise error_at(
             "axles.1.load_kg",
-            f"and the load of axle 3 give one axle {max(share, 1.0 - share):.0%} of the load of "
-            f"both, it must be at most {_LARGEST_UNEVENNESS:.0%}",
+            f"and the load of axle 3 give one axle {100.0 * max(share, 1.0 - share):.0f} % of the "
+            f"load of both, it must be at most {100.0 * _LARGEST_UNEVENNESS:.0f} %",
         )
     errors = [
         (axle.load_kg or 0.0) * axle.load_kg_spread / one

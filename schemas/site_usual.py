@@ -292,7 +292,7 @@ def of_bridge(bridge: Bridge, vehicle: Vehicle) -> Iterator[Implied]:
     deflection = weight * span**3 / (48.0 * rigidity)
     slips = (Slip(key, rigidity, _power(deflection / span, -1.0), _RIGIDITY),)
     text = (
-        f"{bridge.id}: bends by {1e3 * deflection:.3g} mm under {vehicle.id} at rest, 1/"
+        f"{bridge.id}: deflects by {1e3 * deflection:.3g} mm under {vehicle.id} at rest, 1/"
         f"{span / deflection:.0f} of the span"
     )
     yield _implied("static_deflection", text, deflection / span, _DEFLECTION, "", slips)

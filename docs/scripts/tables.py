@@ -89,7 +89,7 @@ _PAGES = {
     "health": "containers.md#watch",
     "history": "history.md",
     "identify": "engineer.md",
-    "import": "recordings.md#tables-of-other-loggers-driveby-import",
+    "import": "recordings.md#tables-of-data-loggers-driveby-import",
     "info": "recordings.md",
     "logger": "logger.md",
     "recover": "logger.md#after-a-crash",
@@ -318,9 +318,13 @@ def _which(row: ParameterSpec) -> str:
 def bridge_reasons() -> str:
     """Return the reasons of fused states, and of excluded crossings."""
     rows = [(f"`{code}`", text) for code, text in BRIDGE_REASON_TEXTS.items()]
-    excluded = LEFT_OUT_TEXTS | {LeftOutReason.SUSPECT: "its verdict is suspect"}
+    whole = {
+        LeftOutReason.SUSPECT: "Its verdict is suspect.",
+        LeftOutReason.NOT_FUSED: "This method's results are not fused.",
+    }
     rows += [
-        (f"`{code}` (excluded)", f"{text[0].upper()}{text[1:]}.") for code, text in excluded.items()
+        (f"`{code}` (excluded)", whole.get(LeftOutReason(code), f"It {text}."))
+        for code, text in LEFT_OUT_TEXTS.items()
     ]
     return _table(("reason", "meaning"), rows)
 

@@ -57,10 +57,8 @@ def _of_state(state: BridgeResult) -> Iterator[str]:
     if state.level is not None and state.thirds is not None:
         thirds = (state.thirds.left, state.thirds.middle, state.thirds.right)
         parts = ", ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
-        yield (
-            f"overall stiffness: {state.level.mean:.2f} ± {state.level.std:.2f} of nominal; "
-            f"thirds {parts}"
-        )
+        yield f"overall stiffness: {state.level.mean:.2f} ± {state.level.std:.2f} of nominal"
+        yield f"thirds of the span: {parts} (standard deviations)"
     if state.between_crossing_std is not None and len(state.crossings_used) == 1:
         yield (
             "single crossing: intervals include the between-crossing variability, which one "

@@ -314,7 +314,8 @@ def _level_lines(crossing: CrossingResult) -> Iterator[str]:
         thirds = (derived.ei_thirds.left, derived.ei_thirds.middle, derived.ei_thirds.right)
         parts = ", ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
         level = derived.ei_level
-        yield f"overall stiffness: {level.mean:.2f} ± {level.std:.2f} of nominal; thirds {parts}"
+        yield f"overall stiffness: {level.mean:.2f} ± {level.std:.2f} of nominal"
+        yield f"thirds of the span: {parts} (standard deviations)"
     if crossing.road is not None and crossing.road.mismatch is not None:
         mismatch = crossing.road.mismatch
         yield (
@@ -347,8 +348,8 @@ def _fit_lines(crossing: CrossingResult) -> Iterator[str]:
         yield from _support_lines(crossing.derived, torsion_declared=declared)
     if "relative_misfit" in diagnostics:
         yield (
-            f"the two road profiles differ by {diagnostics['residual_rms_m'] * 1e6:.2f} µm rms, "
-            f"{100.0 * diagnostics['relative_misfit']:.2g} % of the profile"
+            f"front and rear road profiles differ by {diagnostics['residual_rms_m'] * 1e6:.2f} µm "
+            f"rms, {100.0 * diagnostics['relative_misfit']:.2g} % of the profile"
         )
     if "seconds" in diagnostics:
-        yield f"{diagnostics['seconds']:.1f} s"
+        yield f"computed in {diagnostics['seconds']:.1f} s"

@@ -269,7 +269,7 @@ class RealmModel:
         if row is not None and not row.is_over:
             self.crossings[row.crossing_id] = row._replace(fraction=message.fraction)
         elif not message.crossing_id and message.fraction < 1.0:
-            self.work[service] = f"{message.stage}, {message.fraction:.0%}"
+            self.work[service] = f"{message.stage}, {100.0 * message.fraction:.0f} %"
         else:
             self.work.pop(service, None)
 

@@ -66,7 +66,7 @@ COMMANDS: Final[Mapping[str, ListedCommand]] = {
         {"format=parquet": _HISTORY},
     ),
     "report": ListedCommand(
-        "write results as one printable HTML file, and PDF",
+        "write results as a printable HTML file or PDF",
         _VIEW,
         {"history": ("identify", "history")},
     ),

@@ -172,7 +172,7 @@ def _crossings(rows: Sequence[CrossingRow], *, is_wide: bool) -> Table:
     for row in rows:
         state = Text(row.state, style=_VERDICTS.get(row.state, ""))
         if row.fraction is not None and not row.is_over:
-            state.append(f" {row.fraction:.0%}")
+            state.append(f" {100.0 * row.fraction:.0f} %")
         why = Text(row.reason, style="dim")
         lowest = Text("")
         if row.lowest is not None:

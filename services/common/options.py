@@ -105,7 +105,7 @@ def speed_option(default: float, *, zero: str = "", group: str = "") -> Any:
 
 def config_option() -> Any:
     """Return `--config`: a file of options, which the command line overrides."""
-    text = 'options by name, such as id = "a"; the command line overrides them'
+    text = 'file of options such as id = "a"; the command line overrides it'
     return file_option(text, "CONFIG.toml")
 
 

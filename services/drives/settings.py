@@ -16,7 +16,7 @@ from services.common.options import (
     site_option,
 )
 
-_TABLES: Final = "CSV tables of other loggers"
+_TABLES: Final = "CSV tables of data loggers"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -73,7 +73,7 @@ def gaps(run: InspectedRun) -> CheckFinding:
     longest_s = _longest(np.asarray(holes)) / run.samples.rate_hz
     return check_finding(
         "gaps",
-        f"{holes.mean():.2%} of the samples missing, {run.missing_batches} batches lost, "
+        f"{100.0 * holes.mean():.2f} % of the samples missing, {run.missing_batches} batches lost, "
         f"longest gap {longest_s:.2f} s",
         "check logger and cables: a gap on the bridge rejects the crossing",
         is_wrong=bool(holes.any()),
@@ -196,7 +196,7 @@ def check_assignment(
         )
     return check_finding(
         "channels_in_place",
-        f"the axles' motion explains {explained:.0%} of the body's",
+        f"the axles' motion explains {100.0 * explained:.0f} % of the body's",
         "springs, masses or sensors are not those of the site file",
         is_wrong=found.recorded > signal_checks.MAX_UNEXPLAINED,
     )
@@ -253,7 +253,7 @@ def _swapped(found: quality.ChannelAssignment, names: tuple[str, ...]) -> str:
         for k in range(4)
         if found.best_order[k] != k
     ]
-    return f"{found.recorded:.0%} of the body's motion unexplained: {', '.join(pairs)}"
+    return f"{100.0 * found.recorded:.0f} % of the body's motion unexplained: {', '.join(pairs)}"
 
 
 def _inverted(found: quality.ChannelAssignment, names: tuple[str, ...]) -> str:
@@ -294,7 +294,7 @@ def masses(vehicle: Vehicle, acceleration: Floats, step_s: float) -> Iterator[Ch
     found = quality.stiffness_per_mass(acceleration, step_s, declared, damping)
     for end, measured, known in zip(("front", "rear"), found, declared.tolist(), strict=True):
         text = (
-            f"{end}: the body's motion shows a spring of {measured:.0f} /s² over its mass, "
+            f"{end}: k/m of the body {measured:.0f} 1/s² by its motion, "
             f"{known:.0f} by the site file"
         )
         if measured > _LARGEST_FACTOR * known:

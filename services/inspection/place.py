@@ -167,7 +167,7 @@ def _findings_of_track(
     ):
         yield check_finding(
             name,
-            f"{where}: {have_m:.0f} m recorded {side} it, {want_m:.0f} m are used",
+            f"{where}: {have_m:.0f} m recorded {side} it, of {want_m:.0f} m wanted",
             f"record more road {side} the bridge: the profile mismatch is measured there",
             is_wrong=have_m < _SHORT * want_m,
         )

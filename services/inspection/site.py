@@ -51,10 +51,10 @@ def findings_of_truck(vehicle: Vehicle) -> Iterator[CheckFinding]:
     share = abs(front - rear) / (front + rear)
     yield check_finding(
         "axle_loads",
-        f"{name}: axles carry {front / 1e3:.2f} and {rear / 1e3:.2f} t, "
-        f"they differ by {share:.0%} of the total",
-        f"load one axle more: below {ALIKE_LOADS:.0%} both deflect the bridge nearly alike, and "
-        "the profile can hardly be separated from the deflection",
+        f"{name}: axles carry {front / 1e3:.2f} and {rear / 1e3:.2f} t "
+        f"and differ by {100.0 * share:.0f} % of the total",
+        f"load one axle more: below {100.0 * ALIKE_LOADS:.0f} % both deflect the bridge nearly "
+        "alike, and the profile can hardly be separated from the deflection",
         is_wrong=share < ALIKE_LOADS,
     )
     low, high = _AXLE_LOADS_KG
@@ -62,7 +62,7 @@ def findings_of_truck(vehicle: Vehicle) -> Iterator[CheckFinding]:
     yield check_finding(
         "total_mass",
         f"{name}: total mass {vehicle.total_mass_kg / 1e3:.2f} t, known to "
-        f"{vehicle.spread('total_mass_kg'):.1%}",
+        f"{100.0 * vehicle.spread('total_mass_kg'):.1f} %",
         f"total_mass_kg or front_axle_to_cg_m cannot be right, an axle carries {low / 1e3:g} to "
         f"{high / 1e3:g} t"
         if is_mass_odd
@@ -83,7 +83,7 @@ def findings_of_truck(vehicle: Vehicle) -> Iterator[CheckFinding]:
         f"{name}: {tyres_in_words(vehicle)}",
         ""
         if is_known
-        else "declare twin_tyre_distance_m (0 for single tyres) and tyre_width_m: they determine "
+        else "declare twin_tyre_distance_m (0 for single tyres) and tyre_width_m. They determine "
         "how well a single element can be resolved",
     )
 
@@ -101,9 +101,9 @@ def tyres_in_words(vehicle: Vehicle) -> str:
     """Return the tyres of the site file in words, with the assumed ones."""
     distance = vehicle.twin_tyre_distance_m
     if distance is None:
-        return "the tyres are not declared, twin ones are assumed behind"
+        return "tyres are not declared and twin rear tyres assumed"
     kinds = ["twin" if apart > 0.0 else "single" for apart in distance]
-    return f"{kinds[0]} tyres in front, {kinds[1]} behind"
+    return f"{kinds[0]} front tyres, {kinds[1]} rear tyres"
 
 
 def sampling(rates_hz: tuple[float, ...]) -> CheckFinding:

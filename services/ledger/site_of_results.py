@@ -53,6 +53,6 @@ def _site_nearby(path: Path, results: Results) -> tuple[Site, str]:
     if possible:
         return possible[0]
     raise InputError(
-        f"{path}: results do not say where their bridge is: give --site, or put the recording "
+        f"{path}: results lack the bridge's position: give --site, or put the recording "
         "(.mcap) that they come from into the same folder"
     )

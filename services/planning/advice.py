@@ -48,7 +48,7 @@ def mismatch_in_words(found: SurveyForecast) -> str:
     else:
         given = "" if has_declared_offset(vehicle) else " (no rear_axle_offset_m)"
         which = "rear axle offset"
-    return f"{which} {offset_mm:g} mm{given}, wheel paths ± {found.road.wander_m:g} m"
+    return f"{which} {offset_mm:g} mm{given}, lateral wander {found.road.wander_m:g} m"
 
 
 def percent(share: float) -> str:
@@ -149,6 +149,6 @@ def warnings(found: SurveyForecast) -> Iterator[str]:
         )
     if found.compared_m < SHORTEST_APPROACH_M:
         yield (
-            f"at {found.question.speed_m_per_s:g} m/s {found.compared_m:.0f} m of road beside the "
-            f"bridge are compared, {SHORTEST_APPROACH_M:g} m are needed: drive faster"
+            f"at {found.question.speed_m_per_s:g} m/s {found.compared_m:.0f} m of road before and "
+            f"after the bridge are compared, {SHORTEST_APPROACH_M:g} m are needed: drive faster"
         )

@@ -84,18 +84,19 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
         f"overall stiffness: ± {_percent(planned.once.level_std)} after 1 crossing, "
         f"± {_percent(planned.expected.level_std)} after {question.crossings}"
     )
-    yield "±: standard deviation of EI, near 55 % the prior's; seen: probability that the"
-    yield "loss is detected against the nominal value; vs others: against the others;"
+    yield "±: standard deviation of EI; near 55 % it is the prior's; seen: probability that"
+    yield "the loss is detected against the nominal value; vs others: against the others;"
     yield f"smallest: loss that is detected with {percent(DETECTION_PROBABILITY)} probability"
     yield ""
     yield from _aligned(_comparison(found))
     wanted = percent(DETECTION_PROBABILITY)
     yield f"after {question.crossings} crossings; overall, mid: standard deviations of the overall"
     yield "stiffness and of EI at midspan; seen, smallest: at midspan; needed, ends:"
-    yield f"crossings until the loss is detected with {wanted} at midspan, at both ends"
-    yield f"(elsewhere between them); –: more than {MAX_CROSSINGS};"
+    yield f"crossings until the loss is detected with {wanted} probability at midspan; at both"
+    yield f"ends (elsewhere between the two numbers); –: more than {MAX_CROSSINGS};"
     yield "at … t: only if legal axle and total loads allow it;"
-    yield "the other way: in the opposite lane; … elements: fewer, longer ones"
+    yield "the other way: in the other direction, in the opposite lane;"
+    yield "… elements: fewer, longer ones"
     yield ""
     for line in warnings(found):
         yield f"warning: {line}"

@@ -31,35 +31,35 @@ class ReplaySettings:
     )
     endpoint: str | None = endpoint_option()
     tls: Path | None = tls_option()
-    name: str | None = opt("realm replay-NAME (default: name of the first recording)")
+    name: str | None = opt("NAME in the realm replay-NAME (default: name of the first recording)")
     site: Path | None = site_option(
         "site file of the bridges, for jumps to crossings (default: that of the recording)"
     )
-    speed: float = speed_option(1.0, zero="0 for as fast as possible", group="when")
+    speed: float = speed_option(1.0, zero="0 for as fast as possible", group="time")
     start: str | None = opt(
         "start in seconds into the drive, or as a time in UTC (2026-09-21T22:33:20)",
-        group="when",
+        group="time",
         metavar="S|TIME",
     )
     end: str | None = opt(
-        "end, given as for --start", group="when", alternatives="end", metavar="S|TIME"
+        "end, given as for --start", group="time", alternatives="end", metavar="S|TIME"
     )
     duration: float | None = opt(
         "duration in seconds of the drive",
         number("seconds", low=1e-3, high=1e9),
-        group="when",
+        group="time",
         alternatives="end",
         metavar="S",
     )
-    skip_gaps: bool = flag("skip gaps of more than 2 s", group="when")
+    skip_gaps: bool = flag("skip gaps of more than 2 s", group="time")
     loop: bool = flag(
-        "repeat without end (loggers and workers take the first pass only)", group="when"
+        "repeat without end (loggers and workers take the first pass only)", group="time"
     )
-    paused: bool = flag("begin paused; needs a terminal", group="when")
+    paused: bool = flag("begin paused; needs a terminal", group="time")
     topics: tuple[str, ...] = opt(
         f"topics to publish: {_PATTERNS} (accel,gnss or vehicle/*/accel)",
         names,
-        group="what",
+        group="messages",
         default=(),
         action="extend",
         metavar="PATTERN",
@@ -67,7 +67,7 @@ class ReplaySettings:
     exclude: tuple[str, ...] = opt(
         "topics to leave out, given as for --topics",
         names,
-        group="what",
+        group="messages",
         default=(),
         action="extend",
         metavar="PATTERN",
@@ -75,14 +75,14 @@ class ReplaySettings:
     vehicle: tuple[str, ...] = opt(
         "publish the messages of these trucks only, and no results",
         names,
-        group="what",
+        group="messages",
         default=(),
         action="extend",
         metavar="ID",
     )
     rename: tuple[str, ...] = opt(
         "publish a truck under another name (the messages themselves stay as they are)",
-        group="what",
+        group="messages",
         default=(),
         action="append",
         metavar="OLD=NEW",

@@ -194,7 +194,7 @@ def measures_of(crossing: CrossingResult, language: Language) -> Iterator[Measur
     if derived is not None:
         deflection_mm = 1e3 * derived.max_deflection_m.mean
         yield Measure("f1", "f1", language.number(derived.f1_hz.mean, ".2f"))
-        yield Measure("deflection", "deflection", language.number(deflection_mm, ".3f"))
+        yield Measure("deflection", "deflection", language.number(deflection_mm, ".2f"))
         if derived.springs_believed is not None:
             share = language.number(100.0 * derived.springs_believed, ".0f")
             yield Measure("springs", "springs", share)

@@ -21,8 +21,8 @@ from services.common.options import (
 _TRUTH: Final = "truth"
 _RECEIVER: Final = "receiver"
 _RUNS: Final = "several runs"
-_SURFACE: Final = "two-dimensional road surface"
-_BEYOND: Final = "effects that a site file does not declare (default: none)"
+_SURFACE: Final = "2-D road surface"
+_BEYOND: Final = "further effects (default: none, or the site's)"
 
 
 def _ratios(text: str) -> tuple[float, ...]:
@@ -54,14 +54,14 @@ class SimulateOptions:
         required=True,
         metavar="1,1,.4,…",
     )
-    site: Path | None = site_option("truck and bridge (default: those of the paper)")
+    site: Path | None = site_option("site file (default: truck and bridge of the paper)")
     axles: int | None = opt(
         "axles of the truck; 3: a loaded tipper with an equalised tandem, unless the site's "
         "truck has one (default: the site's truck, or 2)",
         int,
         choices=(2, 3),
     )
-    road: str = opt("ISO 8608 class (default: A)", default="A", choices=tuple("ABCDE"))
+    road: str = opt("road class by ISO 8608 (default: A)", default="A", choices=tuple("ABCDE"))
     seed: int = seed_option()
     noise: float = noise_option("accelerometers' noise density in µg/√Hz (default: 0)")
     speed: tuple[float, float] = opt(
@@ -80,7 +80,7 @@ class SimulateOptions:
         "simulate exact positions and speeds (default)", alternatives=_RECEIVER
     )
     rate: float | None = opt(
-        "sampling rate (default: the site's, or 1000)",
+        "sampling rate in Hz (default: the site's, or 1000)",
         number("a rate in Hz", low=50, high=50_000),
         metavar="HZ",
     )

@@ -1,7 +1,7 @@
 """Common parts of the figures: style, colours, labels, and the look of doubtful results.
 
 Colours are Okabe and Ito's, and no information is in colour alone: doubtful values are hatched,
-weak elements are darker and marked, lines differ by their dashes. Figures use Matplotlib's objects
+weak elements are orange and marked, lines differ by their dashes. Figures use Matplotlib's objects
 and the Agg canvas, never pyplot: no global state, no window.
 """
 

@@ -35,7 +35,9 @@ class WorkerSettings:
     realm: str = realm_option()
     site: Path = site_option("site file of trucks and bridges", required=True)
     folder: Path = folder_option("folder of the results")
-    file: Path | None = output_option("single new file for the results (and .json)", "RESULTS.mcap")
+    file: Path | None = output_option(
+        "single new file for the results, and its .json", "RESULTS.mcap"
+    )
     method: str = method_option()
     processes: int = opt(
         "number of processes that identify crossings, one at a time each (default: 1)",

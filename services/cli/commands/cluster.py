@@ -39,7 +39,7 @@ class ClusterOptions:
         metavar="FOLDER",
     )
     memory: str = opt(
-        "memory limit of a worker, e.g. 2GiB (default: auto, its share of this machine's)",
+        "memory limit of a worker, e.g. 2GiB (default: auto, its share of all memory)",
         default="auto",
         metavar="SIZE",
     )

@@ -16,7 +16,8 @@ class DemoOptions:
     out: Path | None = output_folder_option("new folder for the outputs")
     speed: float = speed_option(4.0)
     noise: float = noise_option(
-        "accelerometers' noise density in µg/√Hz; 0: exact sensors, least-squares (default: 25)",
+        "accelerometers' noise density in µg/√Hz; 0: exact sensors and method least-squares "
+        "(default: 25)",
         25.0,
     )
     live: bool = flag("show it live in the viewer")

@@ -253,7 +253,7 @@ def _state(one: "RecordingSummary") -> str:
     damage = f", {one.info.damaged_chunks} damaged places" if one.info.damaged_chunks else ""
     if one.info.truncated:
         return f"being written or cut off{damage}"
-    return f"whole{damage}" if not damage else damage.removeprefix(", ")
+    return damage.removeprefix(", ") or "complete"
 
 
 def _direction(passing: "DetectedCrossing") -> str:

@@ -39,10 +39,10 @@ class ReportOptions:
         "site file of the bridges (default: that of a recording in the results' folder)"
     )
     baseline: Path | None = file_option(
-        "earlier results, shown beside these with the change (default: the site file's)",
+        "earlier results, shown next to these with the change (default: the site file's)",
         "BEFORE.json",
     )
-    language: str = opt("language (default: en)", default="en", choices=tuple(LANGUAGES))
+    language: str = opt("report language (default: en)", default="en", choices=tuple(LANGUAGES))
     history: Path | None = file_option(
         "add a page with each bridge over time, from this history", "DIR"
     )

@@ -26,7 +26,7 @@ class SurveyPlanOptions:
     """Options of `driveby survey`: a survey to forecast, and outputs."""
 
     site: Path = site_option(
-        "site file of truck, bridge and sensors, as docs/site.example.toml; its first vehicle "
+        "site file of truck, bridge and sensors, such as docs/site.example.toml; its first vehicle "
         "and bridge are used",
         required=True,
     )
@@ -49,7 +49,8 @@ class SurveyPlanOptions:
         metavar="M_PER_S",
     )
     road: str | None = opt(
-        "ISO 8608 class (default: the site's road_class, or A, the best)", choices=tuple("ABCDE")
+        "road class by ISO 8608 (default: the site's road_class, or A, the best)",
+        choices=tuple("ABCDE"),
     )
     tyres: str | None = opt(
         "tyres of the rear axle; single: like the front ones (default: the site's, or twin)",

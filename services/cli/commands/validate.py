@@ -85,7 +85,7 @@ class ValidateOptions:
     )
     noise: float = noise_option("accelerometers' noise density in µg/√Hz (default: 0)")
     site: Path | None = site_option(
-        "truck and bridge (default: those of the paper); without --method: site validation "
+        "site file (default: truck and bridge of the paper); without --method: site validation "
         "for every pair of them (exit code 1 if one fails)"
     )
     json: Path | None = output_option(
@@ -93,18 +93,20 @@ class ValidateOptions:
     )
     figures: Path | None = output_folder_option("folder for figures")
     particles: int = opt(
-        "particles of the paper's random-walk search (default: 500)",
+        "number of particles of the paper's random-walk search (default: 500)",
         whole("particles", 1),
         default=500,
     )
     steps: int = opt(
-        "steps of the paper's random-walk search (default: 600)", whole("steps", 1), default=600
+        "number of steps of the paper's random-walk search (default: 600)",
+        whole("steps", 1),
+        default=600,
     )
     seed: int = seed_option()
     method: str | None = opt(
-        "paper: the paper's search and least squares, without sensors; pre: coverage of its "
-        "intervals (exit code 1 if a criterion is not met; the options below) (default: paper; "
-        "with --site and no --method a site validation runs instead)",
+        "paper: the paper's search and least squares, without sensors; pre: coverage of intervals, "
+        "with the options below; exit code 1 on a missed aim (default: paper; with --site: site "
+        "validation)",
         choices=("paper", "pre"),
     )
     truck: str | None = opt(
@@ -157,7 +159,7 @@ class ValidateOptions:
         metavar="all|twin,steady,…",
     )
     truth: Path = opt(
-        "folders of crossings with a truth.json (default: ../shared/crossings)",
+        "parent folder of crossings with a truth.json (default: ../shared/crossings)",
         Path,
         default=Path("../shared/crossings"),
         metavar="DIR",

@@ -28,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
 def test_sample_is_printed_in_full(capsys: pytest.CaptureFixture[str], project: Path) -> None:
     code, out, err = run(capsys, "info", project / "recordings/sample/crossing.mcap")
     assert (code, err) == (0, "")
-    assert "319 kB, whole" in out
+    assert "319 kB, complete" in out
     assert "2026-01-01 00:00:00.0 to 00:00:08.9 UTC, 8.9 s" in out
     assert "site: truck-1 over bridge-1 (30 m, 7 elements)" in out
     assert "accel: 179 messages, 20 a second" in out

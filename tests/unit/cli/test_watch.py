@@ -67,7 +67,7 @@ def test_a_morning_on_a_wide_terminal(site: Site) -> None:
     )
     assert line(lines, "14:17:20").endswith("EI_4 0.40 (0.38–0.42) model_misfit")
     assert line(lines, "14:18:20").endswith("rejected channel_missing")
-    assert line(lines, "14:22:30").endswith("truck-1 → bridge-1 identifying 45%")
+    assert line(lines, "14:22:30").endswith("truck-1 → bridge-1 identifying 45 %")
     assert line(lines, "14:23:16").endswith("truck-2 → bridge-1 on the bridge")
     assert "60 % less stiff than the other elements" in line(lines, "bridge-1")
     assert line(lines, "logger") == "logger well 120 messages/s, queue 3, lost 0, dropped 0"
@@ -166,7 +166,7 @@ def test_a_service_that_is_silent_or_unwell_stands_out() -> None:
     deliver(watched, health("worker"))
     deliver(watched, progress("worker", "", "validating truck-1 on bridge-1", 0.3))
     assert line(drawn(watched), "logger") == "logger not well disk full"
-    assert line(drawn(watched), "worker") == "worker well validating truck-1 on bridge-1, 30%"
+    assert line(drawn(watched), "worker") == "worker well validating truck-1 on bridge-1, 30 %"
     watched.services["worker"] = watched.services["worker"]._replace(time_ns=NOW_NS - 10**12)
     assert line(drawn(watched), "worker").startswith("worker silent 17 min")
 
@@ -197,7 +197,7 @@ def test_what_cannot_be_read_is_left_out() -> None:
     assert not watched.services
 
 
-SENTENCE = "element 4 is 10 % less stiff than before 2026-08-27, interval 8 to 12 %"
+SENTENCE = "element 4 is 10 % less stiff than before 2026-08-27 (95 % interval 8 to 12 %)"
 
 
 def test_an_alarm_is_a_line_until_it_is_another(site: Site) -> None:

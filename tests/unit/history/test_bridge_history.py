@@ -197,7 +197,7 @@ def test_one_month_is_nothing_to_compare_with(
 
 
 def test_an_alarm_stands_until_somebody_has_taken_note_of_it(past: BridgeHistory) -> None:
-    said = "element 4 is 20 % less stiff than before 2026-03-05, interval 18 to 22 %."
+    said = "element 4 is 20 % less stiff than before 2026-03-05 (95 % interval 18 to 22 %)."
     standing = past._replace(alarms=(alarm(),))
     text = Seen(history_section(standing, "h-")).text
     assert f"Alarm of 2026-03-10: {said} The alarm is active: it is not acknowledged." in text

@@ -43,7 +43,10 @@ def test_a_weak_element_is_named_with_its_place_loss_and_interval() -> None:
     half = 1.96 * 0.03 * np.hypot(1.0, 1.25 / np.sqrt(6.0))
     assert (weak.low, weak.high) == pytest.approx((0.4 * np.exp(-half), 0.4 * np.exp(half)), 1e-3)
     assert sentences(found) == [
-        "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements, interval 57 to 63 %.",
+        (
+            "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements "
+            "(95 % interval 57 to 63 %)."
+        ),
         ENGLISH.text("rest.others", within=3, loss=16),
     ]
 
@@ -207,11 +210,14 @@ def test_unresolved_elements_are_never_said_to_agree() -> None:
     found = compared()
     assert describe_comparison(found) == sentences(found)
     assert describe_comparison(found, frozenset({1, 5}), LEVEL) == [
-        "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements, interval 57 to 63 %.",
+        (
+            "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements "
+            "(95 % interval 57 to 63 %)."
+        ),
         "The loss may also be in element 5, which is adjacent and not resolved.",
         "Elements 1 and 5 are not resolved (standard deviation above 25 %).",
         ENGLISH.text("rest.resolved", loss=16),
-        "The overall stiffness is 0.90 of the nominal value ± 10 %.",
+        "The overall stiffness is 0.90 times the nominal value, ± 10 %.",
     ]
     sound = compared(np.ones(7))
     assert describe_comparison(sound, frozenset({7})) == [

@@ -211,7 +211,7 @@ def test_a_recording_that_begins_too_late(tmp_path: Path) -> None:
         channels={name: values[late] for name, values in run.channels.items()},
     )
     found = findings(tmp_path, cut, case.site)
-    assert "7 m recorded before it, 39 m are used" in found["approach_before"][0].text
+    assert "7 m recorded before it, of 39 m wanted" in found["approach_before"][0].text
 
 
 def standstill(noise_ug: float, rate_hz: float = 500.0) -> Run:

@@ -71,8 +71,8 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     text = reported(site, results_of(site, *crossings, used="b")).text
     assert "One element is clearly less stiff." in text
     assert (
-        "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements, interval 58 to 62 %."
-        in text
+        "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements "
+        "(95 % interval 58 to 62 %)." in text
     )
     assert ENGLISH.text("rest.others", within=3, loss=16) in text
     assert "where it is least accurate, one of 16 %." in text
@@ -92,7 +92,7 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     assert "Drive again on another day, in the other direction and with another truck." in text
     assert "Keep these results as a baseline" in text
     # Where there is no baseline that is said, and what it means.
-    assert "each other (no baseline is stored)" in text
+    assert "the other elements (no baseline is stored)" in text
     assert "A loss that affects all elements equally cannot be detected without a baseline." in text
     # The evidence.
     assert "reduced chi-square (χ²/dof) 1.02 1.02 mean square of the residuals" in text
@@ -120,7 +120,7 @@ def test_a_nominal_value_that_is_too_high_is_no_damage_everywhere(site: Site) ->
     text = reported(site, sound).text
     assert "No element is clearly less stiff." in text
     assert ENGLISH.text("all.others", within=1, loss=0).partition(" 0 %")[0] in text
-    assert "(not the overall stiffness, which is a mean) is 0.86 of the nominal value" in text
+    assert "(not the overall stiffness, which is a mean) is 0.86 times the nominal value" in text
 
 
 def test_a_baseline_shows_what_all_elements_share(site: Site, tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_a_baseline_shows_what_all_elements_share(site: Site, tmp_path: Path) ->
     now = results_of(site, some_crossing("b"), used="b", ratios=0.7 * RATIOS)
     text = reported(site, now, baseline=then).text
     assert "7 elements are clearly less stiff." in text
-    assert "Element 1, 0.0 to 4.3 m: 30 % less stiff than the baseline, interval" in text
+    assert "Element 1, 0.0 to 4.3 m: 30 % less stiff than the baseline (95 % interval" in text
     assert "Compared with the baseline then.json" in text
     assert "element 1 (0.0 to 4.3 m from the south-west end)" in text
     last = (
@@ -436,7 +436,7 @@ def test_what_cannot_be_reported_is_one_line_and_leaves_nothing(
     parameters = {k: v for k, v in content["crossings"][0]["parameters"].items() if k != "EI_7"}
     with_site = ("--site", site)
     for arguments, words in (
-        ((found,), "results do not say where their bridge is"),
+        ((found,), "results lack the bridge's position"),
         ((tmp_path / "none.json", *with_site), "no such file"),
         ((site, *with_site), "not a results file"),
         ((found, *with_site, "-o", tmp_path / "r.txt"), "an HTML file (.html) is expected"),
@@ -624,7 +624,7 @@ def test_a_loss_beside_unresolved_elements_may_be_theirs(site: Site) -> None:
     assert (
         "Elements 1, 2, 3 and 7 are not resolved (standard deviation above 25 %). "
         f"{ENGLISH.text('rest.resolved', loss=40)} "
-        "The overall stiffness is 0.97 of the nominal value ± 10 %." in text
+        "The overall stiffness is 0.97 times the nominal value, ± 10 %." in text
     )
     assert "differs clearly" not in text  # of what is known to a factor nothing is stated
     assert text.count("not resolved") == 2 + 4  # in words, and in the table
@@ -640,13 +640,13 @@ def test_where_no_element_is_resolved_none_is_called_sound(site: Site) -> None:
     assert "No single element is resolved" in found.text
     assert "No element" not in found.text
     few = reported(site, fused(site, [0.6, 0.05, 0.05, 0.5, 0.05, 0.05, 0.05])).text
-    assert "Elements 1 and 4 could not be determined; of the others none is clearly less" in few
+    assert "Elements 1 and 4 could not be determined; no other element is clearly less" in few
 
 
 @pytest.mark.parametrize(
     ("spreads", "headline"),
     [
-        ([0.02] * 6 + [0.3], "Element 7 could not be determined; of the others none"),
+        ([0.02] * 6 + [0.3], "Element 7 could not be determined; no other element"),
         ([0.02] * 6 + [0.12], "No element is clearly less stiff, but a loss of 20 % would not"),
         ([0.24] * 7, "No element is clearly less stiff, but a loss of 20 % would not"),
         ([0.3] * 7, "Only the stiffness of the whole bridge could be determined"),

@@ -320,7 +320,7 @@ def test_a_tandem_is_written_as_it_was_read(bogie: str) -> None:
         ),
         (
             (BOGIE + "shares = [0.9, 0.1]\n", SENSORS),
-            "vehicle.bogies[0].shares give one axle 90% of the force, it must be at most 80%",
+            "vehicle.bogies[0].shares give one axle 90 % of the force, it must be at most 80 %",
         ),
         ((BOGIE.replace("[2, 3]", "[1, 2]"), SENSORS), "vehicle.bogies does not join axles 2 and"),
         ((BOGIE,), "vehicle.sensors is missing, it must place two accelerometers on the body"),

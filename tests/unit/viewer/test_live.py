@@ -311,7 +311,8 @@ def test_an_alarm_heads_the_text_of_its_bridge_while_it_stands(live: Live, site:
     live.picture.ingest(alarm())
     chunks = live.drawn()
     heads = (
-        "### Alarm\n\n**Element 4 is 10 % less stiff than before 2026-08-27, interval 8 to 12 %.**"
+        "### Alarm\n\n**Element 4 is 10 % less stiff than before 2026-08-27 "
+        "(95 % interval 8 to 12 %).**"
     )
     raised = f"{heads} Raised 2026-09-20, not acknowledged.\n\n"
     texts = values(rows(chunks, "said/bridge-1"), "TextDocument:text")
