@@ -12,7 +12,7 @@ from services.viewer.figure import draw_crossing
 
 
 def plot(found: Solution | Identification, truth: Simulation | None = None) -> Figure:
-    """Draw one crossing, with the truth beside it where it is known.
+    """Draw one crossing, with the truth next to it where it is known.
 
     An `Identification` of several crossings is refused with InputError: draw its `solutions` one by
     one. The figure is no pyplot's: Jupyter shows it after `%matplotlib inline`, and

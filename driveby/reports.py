@@ -23,7 +23,7 @@ def report(
 ) -> Path:
     """Write results (files, or what `identify` returned) as one printable HTML file.
 
-    `baseline` is an earlier results file, whose numbers stand beside these; `language` is `en` or
+    `baseline` is an earlier results file, whose numbers stand next to these; `language` is `en` or
     `de`. `site` is needed where the folder of a results file has no recording. Return the path.
     Raise InputError, in one line, for results that cannot be reported.
     """

@@ -158,4 +158,4 @@ def _check_key(path: Path, certificate: x509.Certificate) -> None:
         raise InputError(f"{path}: is no private key in PEM form without a password") from None
     form = (Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
     if key.public_key().public_bytes(*form) != certificate.public_key().public_bytes(*form):
-        raise InputError(f"{path}: is not the key of {CERTIFICATE} beside it")
+        raise InputError(f"{path}: is not the key of {CERTIFICATE} next to it")

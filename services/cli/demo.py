@@ -303,7 +303,8 @@ def _wait(
             # A truck that has driven may leave; a service may not, even with exit code 0.
             if one.process.poll() not in (None, 0 if one.name == "truck" else None):
                 raise FailureError(f"the {one.name} ended early: {_last_line(one.log)}")
-    raise FailureError(f"{otherwise} after {timeout_s:.0f} s; see the logs beside {running[0].log}")
+    log = running[0].log
+    raise FailureError(f"{otherwise} after {timeout_s:.0f} s; see the logs next to {log}")
 
 
 def _finish(running: _ChildProcess, with_signal: signal.Signals | None) -> None:

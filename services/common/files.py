@@ -1,4 +1,4 @@
-"""Files that are complete or absent: written beside the target, synced, renamed.
+"""Files that are complete or absent: written next to the target, synced, renamed.
 
 An output replaces a file of its own kind only, never a site file, and never a file that the command
 reads (`services.common.outputs`). A recording is replaced only with `force`, and never while it is
@@ -47,7 +47,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def replaced_atomically(path: Path, *, force: bool = False) -> Iterator[Path]:
-    """Yield a temporary path beside `path` to write to; rename it when the block succeeds.
+    """Yield a temporary path next to `path` to write to; rename it when the block succeeds.
 
     The temporary name keeps the suffix, because writers choose the format by it. If the block
     raises, or `path` must not be replaced (see `check_writable`), the temporary file is removed and
@@ -114,7 +114,7 @@ def name_error(path: Path, error: OSError) -> InputError:
 
 
 def _temporary(path: Path) -> Path:
-    """Return a free name beside `path` with its suffix, within the limit of file systems."""
+    """Return a free name next to `path` with its suffix, within the limit of file systems."""
     token = secrets.token_hex(4)
     name = f".{path.stem}.{token}.part{path.suffix}"
     if len(os.fsencode(name)) > _LONGEST_NAME:

@@ -1,6 +1,6 @@
 """Folders on the local disk or in object storage, through fsspec: listing, ranges, whole files.
 
-A file appears completely or not at all: locally it is written beside and renamed, an object store
+A file appears completely or not at all: locally it is written under another name, an object store
 shows an object once its upload is complete. Nothing is ever changed in place.
 """
 

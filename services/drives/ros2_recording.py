@@ -114,7 +114,7 @@ def _check_file(path: Path) -> None:
     log = path.with_name(f"{path.name}-wal")
     if log.is_file() and log.stat().st_size:
         raise InputError(
-            f"{path}: its last messages are in {log.name} beside it, as its writer did not end "
+            f"{path}: its last messages are in {log.name} next to it, as its writer did not end "
             f"normally; sqlite3 {path.name} 'PRAGMA wal_checkpoint(TRUNCATE)' merges them"
         )
 

@@ -74,7 +74,7 @@ def sampling_rate_hz(time_s: Floats) -> float:
 def normalised(run: Run, sensor: Sensor) -> Run:
     """Return the run with accelerations upward and without gravity; `sensor` declares the input.
 
-    Channels beside the four point up. An accelerometer at rest whose axis points up reads +g.
+    Other channels than the four point up. An accelerometer at rest whose axis points up reads +g.
     """
     gravity = STANDARD_GRAVITY_M_PER_S2 if sensor.gravity_included else 0.0
     signs = dict(zip(CHANNELS, sensor.up, strict=True))

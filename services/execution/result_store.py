@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 EDITION: Final = "1"
 KEY: Final = "driveby.identified"
 BRIDGES: Final = "bridges.json"
-"""Results file beside the results, with the bridges alone, of the run that ended last."""
+"""Results file next to the results, with the bridges alone, of the run that ended last."""
 _MAX_AT_ONCE = 1000
 """Number of crossings read into memory at once, some 20 MB."""
 _MOST: Final = ReadLimits(rows=1_000_000, bytes=4 << 30)

@@ -1,6 +1,6 @@
 """Compile the numerical kernels ahead of time: `python -m services.execution.warm_up`.
 
-numba stores the compiled form beside the sources, for every later start of any command. It notices
+numba stores the compiled form next to the sources, for every later start of any command. It notices
 a change of a kernel's own file, but not of another kernel that it has inlined: so everything is
 compiled again when any source is newer than its compiled form.
 

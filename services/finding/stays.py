@@ -74,7 +74,7 @@ class AxleGeometry(Protocol):
 
 
 class AntennaFixes(NamedTuple):
-    """Fixes of a truck beside a bridge: arrays (m,), in order of time."""
+    """Fixes of a truck next to a bridge: arrays (m,), in order of time."""
 
     time_s: Floats
     chainage_m: Floats

@@ -1,7 +1,7 @@
 """Files of alarms in a history: reading and acknowledging.
 
 An alarm is a file `alarms/realm=R/bridge=B/ID.json` that is written once; its acknowledgement is
-`ID.ack.json` beside it. Nothing removes either: an alarm stands until it is acknowledged, whatever
+`ID.ack.json` next to it. Nothing removes either: an alarm stands until it is acknowledged, whatever
 later crossings show, and over any restart. An alarm's id is a hash of its content, so two programs
 that raise it write one file.
 """

@@ -59,7 +59,7 @@ def write_draws(
 ) -> None:
     """Write the draws of the crossings that have some; an existing file is replaced.
 
-    A NetCDF file also gets `groups` beside its group `posterior`.
+    A NetCDF file also gets `groups` in addition to its group `posterior`.
     """
     some = [crossing for crossing in crossings if crossing.draws]
     if path.suffix == ".nc":

@@ -39,7 +39,7 @@ def footprints_of(
 
 
 def lead_footprint_of(vehicle: Vehicle) -> Footprint:
-    """Return the footprint of the axle ahead of a tandem, beside that of the tandem's first one.
+    """Return the footprint of the axle ahead of a tandem, with that of the tandem's first one.
 
     For a truck of two axles it is the typical front axle's.
     """

@@ -3,7 +3,7 @@
 Rewriting the whole file for every crossing takes a time that grows with the square of their number
 (51 GB for a thousand). Here a crossing overwrites the file's end, and the end is written again
 behind it. The file is the same byte for byte as one written at once. A process killed between the
-two leaves a truncated file; the recording beside it, which is synced first, is complete, and the
+two leaves a truncated file; the recording next to it, which is synced first, is complete, and the
 next run writes the JSON file again from it (`runs`).
 """
 

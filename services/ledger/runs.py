@@ -1,7 +1,7 @@
 """The worker's results on disk, of this run and of earlier runs.
 
 Every run has a file of its own, `results-TIME.mcap`, with the messages that it published, and all
-results of that file as JSON beside it. Together the files of a folder hold each result once.
+results of that file as JSON next to it. Together the files of a folder hold each result once.
 """
 
 import logging
@@ -46,7 +46,7 @@ The run may have been killed, or the router lost, of which a publisher learns no
 
 
 class ResultFiles:
-    """Results of a run, as a recording and as JSON beside it; created with the first message."""
+    """Results of a run, as a recording and as JSON next to it; created with the first message."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Prior draws and diagnostics of crossings, beside their posterior draws, as ArviZ groups them."""
+"""Prior draws and diagnostics of crossings, with their posterior draws, as ArviZ groups them."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final

@@ -115,7 +115,7 @@ def _draw(axes: Axes, counts: Floats, values: Floats, title: str) -> None:
 
 
 def _name_lines(axes: Axes, elements: int) -> None:
-    """Name the lines beside the panel, in the elements' order."""
+    """Name the lines next to the panel, in the elements' order."""
     axes.legend(
         loc="upper left",
         bbox_to_anchor=(1.0, 1.0),

@@ -96,7 +96,7 @@ def recover_recording(
     set_aside: bool = False,
     progress: Offset = no_progress,
 ) -> Recovery:
-    """Write the valid content of `source` to `target`, beside it first and then renamed.
+    """Write the valid content of `source` to `target`, next to it first and then renamed.
 
     Messages, channels, metadata and attachments are copied unchanged, foreign topics too. A lost
     schema is taken from our own tables. Damage after the END sentinel affects only the index, which

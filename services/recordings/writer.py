@@ -209,7 +209,7 @@ def write_recording(
     reason: str,
     force: bool = False,
 ) -> int:
-    """Write a whole recording beside `path`, sync it and rename it; return the number of messages.
+    """Write a whole recording next to `path`, sync it and rename it; return the number of messages.
 
     Realm and vehicle are those of the first message. The file depends on nothing but the arguments
     and this program's version: no clock is read. Raise InputError if `path` is not writable, is a

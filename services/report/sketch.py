@@ -68,7 +68,7 @@ def _label(angle: float, along: float, right: float, text: str) -> Html:
 
 
 def _arrow(angle: float, forward: float, right: float) -> Html:
-    """Return the way of a truck beside the bridge."""
+    """Return an arrow next to the bridge in a truck's direction."""
     line = [(-0.7, 0.0), (0.7, 0.0), (0.58, -0.05), (0.7, 0.0), (0.58, 0.05)]
     points = " ".join(
         _point(angle, forward * along * _HALF_LENGTH, right + across * _HALF_LENGTH)

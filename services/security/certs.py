@@ -94,7 +94,7 @@ class _Authority(NamedTuple):
         except (ValueError, TypeError):
             raise InputError(f"{path}: is no private key in PEM form without a password") from None
         if not isinstance(key, _Key) or key.public_key() != self.certificate.public_key():
-            raise InputError(f"{path}: is not the key of {AUTHORITY} beside it")
+            raise InputError(f"{path}: is not the key of {AUTHORITY} next to it")
         return key
 
     def issued(self) -> dict[str, x509.Certificate]:

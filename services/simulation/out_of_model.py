@@ -16,7 +16,7 @@ The ranges, uniform unless stated:
 - air: air springs with an exponent of 1.2 to 1.4;
 - spans: two to five of 12 to 25 m, with eight elements for two, else three for each on average;
 - surface: the road is a 2-D surface under single tyres in front and twin tyres behind, unless
-  the site defines them (`wheel_paths`); the rear axle runs 0 to 10 mm beside the front, the truck
+  the site defines them (`wheel_paths`); the rear axle is 0 to 10 mm off the front one, the truck
   0.12 m from the line (standard deviation);
 - torsion: a lane 0.5 to 2 m off the axis, either side, of a deck whose first torsional frequency is
   1.3 to 3 times the first of bending and whose radius of gyration is 1.8 to 3 m, under single tyres

@@ -42,7 +42,7 @@ class ScenarioOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class IntervalOptions:
-    """The intervals of method `pre` beside the truth of simulated crossings."""
+    """The intervals of method `pre` against the truth of simulated crossings."""
 
     crossings: int
     """Number of crossings whose truth is drawn from the priors."""
@@ -65,7 +65,7 @@ class IntervalOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyOptions:
-    """Fused surveys of method `pre` beside their truth."""
+    """Fused surveys of method `pre` against their truth."""
 
     surveys: int
     """Number of surveys of each kind."""

@@ -1,7 +1,7 @@
 """Wheel paths of a simulated truck on a 2-D road surface, and the profiles along them.
 
 By default both axles follow one profile. On a surface single tyres in front and twin tyres behind
-average over different strips, the rear axle runs some millimetres beside the front one, and the
+average over different strips, the rear axle runs some millimetres off the front one, and the
 truck's lateral position differs from run to run.
 """
 

@@ -57,7 +57,7 @@ _DAY_S = 86_400.0
 def run(asked: WorkerSettings, ready: Callable[[], None] | None = None) -> int:
     """Identify all crossings of a realm until SIGINT or SIGTERM; return 0.
 
-    Results are written to `folder/REALM/results-TIME.mcap` and `.json` beside it, and published.
+    Results are written to `folder/REALM/results-TIME.mcap` and `.json` next to it, and published.
     Unless it has a `file` of its own or the realm is one of replays, the run resumes what earlier
     runs left there, and reads data that trucks no longer send from the logger's `recordings`. It
     waits for the router without limit. `ready` is called once, when the worker listens.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _OVERVIEW = "scenarios.png"
-"""Name of the figure of all scenarios, beside one for each."""
+"""Name of the figure of all scenarios, next to one for each."""
 
 
 def run(asked: ScenarioOptions, console: "Console") -> int:

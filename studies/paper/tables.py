@@ -1,4 +1,4 @@
-"""The paper's tables as data: Tables 1 to 8, CC BY 4.0 (README.md beside them)."""
+"""The paper's tables as data: Tables 1 to 8, CC BY 4.0 (README.md next to them)."""
 
 import json
 from functools import cache

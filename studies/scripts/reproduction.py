@@ -327,7 +327,7 @@ def mesh(scenarios: tuple[int, ...]) -> None:
 
 
 def frequencies(scenarios: tuple[int, ...]) -> None:
-    """Print the paper's Table 5 beside the consistent mass matrix, right and with a wrong sign."""
+    """Print the paper's Table 5 next to the consistent mass matrix, right and with a wrong sign."""
     printed = tables_of_paper()["table5_natural_frequencies_hz"]
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("scenario", "Table 5", "right matrix", "13l/420 flipped", "difference"):

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def run(asked: SurveyOptions, console: "Console") -> int:
     """Simulate missing crossings, fuse, print a line for each kind; 1 if an aim was missed.
 
-    The forecast of `driveby survey` is printed beside the results; for kinds with a weak element a
+    The forecast of `driveby survey` is printed next to the results; for kinds with a weak element a
     second table has the number of crossings needed to detect it.
     """
     read_records(asked.records)

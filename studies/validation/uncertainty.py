@@ -355,7 +355,7 @@ def as_json(outcome: ValidationOutcome) -> dict[str, Any]:
 
 
 def summary(records: list[Record]) -> dict[str, Any]:
-    """Return the figures of the page on simulated crossings beside the aims."""
+    """Return the figures of the page on simulated crossings against the aims."""
     s = scores(records)
     return {
         "elements": elements_of(records),

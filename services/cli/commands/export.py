@@ -154,7 +154,7 @@ def _results(sources: Sequence[Path]) -> "tuple[Results | None, Path]":
 def _site(
     given: Path | None, recordings: list[Path], results: "Results | None", results_path: Path
 ) -> "Site | None":
-    """Return the site file given, of the recordings, or beside the results; None without any."""
+    """Return the site file given, of the recordings, or next to the results; None without any."""
     from schemas.site_file import load_site
     from services.ledger.site_of_results import site_of_results, site_within, wanted_bridges
 

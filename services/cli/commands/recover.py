@@ -44,7 +44,7 @@ def _recover(asked: RecoverOptions) -> int:
 
     source, target = asked.recording, asked.output or recovered_path(asked.recording)
     if asked.set_aside and asked.output is not None:
-        raise InputError("--set-aside goes with the usual name beside the recording, not with -o")
+        raise InputError("--set-aside goes with the usual name next to the recording, not with -o")
     with reading_bar("recovering", [source]) as next_file:
         recovery = recover_recording(
             source, target, force=asked.force, set_aside=asked.set_aside, progress=next_file()

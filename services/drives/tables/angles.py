@@ -1,4 +1,4 @@
-"""Latitudes and longitudes as texts: degrees and minutes, hemispheres beside or within them."""
+"""Latitudes and longitudes as texts: degrees and minutes, hemispheres next to or within them."""
 
 import re
 from collections.abc import Mapping

@@ -43,7 +43,7 @@ class ColumnMap(MapTable):
     factor: Annotated[float, Field(ge=-1e12, le=1e12)] | None = None
     """Factor from the file's number to its `unit`: of counts and volts, or -1 for another sign."""
     side: ColumnName | None = None
-    """Column of N, S, E or W beside a latitude or longitude."""
+    """Column of N, S, E or W next to a latitude or longitude."""
     gravity_included: StrictBool | None = None
     """Whether an accelerometer at rest reads +g where its axis points up."""
     up: Literal[1, -1] | None = None

@@ -121,7 +121,7 @@ def _groups(parts: list[TablePart], *, is_one: bool) -> dict[str, list[TablePart
                 missing = "one file of positions, and each channel once,"
             names = ", ".join(p.name for p in group)
             raise InputError(
-                f"{group[0].sheet.path.parent}: {names}: {missing} expected beside it: files of "
+                f"{group[0].sheet.path.parent}: {names}: {missing} expected next to it: files of "
                 "one run end in the same number, or set run = in each [[file]] of a map (--map)"
             )
     raise AssertionError("unreachable: an incomplete group was found")

@@ -440,7 +440,7 @@ def test_messages_not_yet_in_the_file_are_reported(
     rows.close()
     killed = tmp_path / "killed/bag.db3"
     assert (tmp_path / "killed/bag.db3-wal").stat().st_size
-    assert "its last messages are in bag.db3-wal beside it" in complaint(killed)
+    assert "its last messages are in bag.db3-wal next to it" in complaint(killed)
 
 
 def test_names_that_a_terminal_would_obey_are_shown(

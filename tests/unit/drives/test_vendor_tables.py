@@ -891,7 +891,7 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, str | bytes]], str]] = {
     ),
     "no positions": (
         lambda: {A: table(ACCEL, ";"), "b_00.csv": table(ACCEL, ";")},
-        "positions expected beside it",
+        "positions expected next to it",
     ),
 }
 
