@@ -51,8 +51,8 @@ FAR_OFF_CHI2 = 200.0
 which the fit is not continued, and of a first fit, above which no other offset is tried: fault-free
 crossings had 13 at most from an offset, one with a second vehicle up to 1,900."""
 HOPELESS_CHI2 = 25.0
-"""Value of chi2 after a fit above which it is not repeated with another noise or free ends, nor, at
-a second offset, from a third one."""
+"""Value of chi2 after a fit above which it is repeated neither with other noise or free ends nor,
+after two offsets, from a third."""
 _MAX_ROUNDS, _EARLY_ROUNDS = 6, 2
 """Limit of alternating fits and noise estimates, finally and in earlier stages."""
 _MAX_STEPS, _EARLY_STEPS = 25, 8
@@ -117,8 +117,9 @@ class Optimum(NamedTuple):
 def chi2_per_dof(problem: PosteriorProblem, y: FloatArray) -> float:
     """Return the mean square of whitened residuals at y (size,), per degree of freedom.
 
-    Each search coordinate and each removed wave takes one. With reduced weight of the suspension
-    equations only the mismatch residuals count, and a third of these coordinates and waves.
+    Each search coordinate and each removed wave takes one degree of freedom. With reduced weight of
+    the suspension equations only the mismatch residuals count, and a third of these coordinates and
+    waves.
     """
     rows = data_rows(problem, y[None, :])[0, :: chi2_stride(problem)]
     taken = (y.size + problem.noise.lines.shape[1]) / chi2_stride(problem)

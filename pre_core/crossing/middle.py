@@ -1,10 +1,10 @@
-"""Reduction of sensors anywhere on a truck to the four centre readings of the method.
+"""Reduction of sensors anywhere on a truck to the four middle readings of the method.
 
 Body and axles are rigid. A sensor on the body, a distance o behind the front axle and e to the left
-of the centre line, reads (1 - o/D) z_1 + o/D z_2 + e phi of the accelerations z_1 and z_2 above the
+of the middle, reads (1 - o/D) z_1 + o/D z_2 + e phi of the accelerations z_1 and z_2 above the
 axles, D apart, and of the roll phi; a sensor on an axle reads z_u + e phi_u. The coordinates of
 each part follow by least squares, weighted by the sensors' noise. z_1, z_2 and both z_u are the
-centre readings. Where the noise of z_1 and z_2 is correlated (sensors far from the axles) the
+middle readings. Where the noise of z_1 and z_2 is correlated (sensors far from the axles) the
 method assumes independence.
 """
 
@@ -27,11 +27,11 @@ class SensorPlaces(NamedTuple):
     behind_m: FloatArray
     """Distance behind the front axle, for sensors on the body."""
     lateral_m: FloatArray
-    """Distance to the left of the centre line."""
+    """Distance to the left of the middle."""
 
 
 class Reduction(NamedTuple):
-    """Weights from m sensors to four centre readings: body front and rear, axle front and rear."""
+    """Weights from m sensors to four middle readings: body front and rear, axle front and rear."""
 
     weights: FloatArray
     """Weights (4, m); NaN for a reading that the sensors do not determine."""
@@ -47,7 +47,7 @@ def centre_reduction(
 ) -> Reduction:
     """Return the reduction of sensors at `places` with one-sided noise `density` (m,).
 
-    Sensors less than `in_the_middle_m` to the side are on the centre line. A part with sensors on
+    Sensors less than `in_the_middle_m` to the side are in the middle. A part with sensors on
     one side only, or whose geometry does not determine a reading, has NaN there.
     """
     count = places.axle.size
@@ -93,7 +93,7 @@ def _exact(weights: FloatArray) -> FloatArray:
 
 
 def centre_readings(reduced: Reduction, acceleration: FloatArray) -> FloatArray:
-    """Return the centre readings (4, n) of accelerations (m, n) on one grid.
+    """Return the middle readings (4, n) of accelerations (m, n) on one grid.
 
     A reading of a single sensor equals that sensor's bit for bit.
     """

@@ -143,8 +143,8 @@ def between_run_spectra(front: Footprint, rear: Footprint, wander_m: float) -> F
 def expected_levels(front: Footprint, rear: Footprint, road_class: str) -> FloatArray:
     """Return the levels (s,) in m³ on a surface of an ISO 8608 class under these axles.
 
-    Equal tyres have no mismatch: `mismatch_spectra` treats them as worn ones only because no run
-    can show that they are not.
+    Equal tyres have no mismatch: `mismatch_spectra` treats them as worn, because no run can exclude
+    it.
     """
     at = np.array([REFERENCE_CYCLES_PER_M])
     single, unlike = front._replace(offset_m=0.0), rear._replace(offset_m=0.0)

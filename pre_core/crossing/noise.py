@@ -7,15 +7,15 @@ acceleration noise of densities n_s, n_u enters them as
     s^2 R_i   : [1 + (m_u s^2 + c_s s + k_s)/K] n_u - [(c_s s + k_s)/K] n_s,  K = k_u + c_u s
     s^2 b_i   : [(m_ii s^2 + c_s s)/k_s + 1] n_s - [c_s s/k_s + 1] n_u + [m_12 s^2/k_s] n_s'
 
-(front less rear in the mismatch; n_s' is the noise of the other body sensor). The front's residuals
-are taken when the front wheel was at the rear wheel's present place, so that a sensor in both
+(front less rear in the mismatch; n_s' is the noise of the other body sensor). The front axle's
+residuals are taken when its wheel was at the rear wheel's present place, so that a sensor in both
 counts as two.
 
 Friction and nonlinear dampers put a random force, the suspension noise, into the body equations, of
 a level that the residuals determine (`suspension_noise_levels`). The mismatch is then computed from
 inertia alone, s^2 R_i: [1 + m_u s^2/K] n_u + [m_ii s^2/K] n_s + [m_12 s^2/K] n_s'. Both forms
-differ by (k_s/K) b_i and contain the same information; but the quiet combination of residuals
-depends on the truck, and each form has it in a residual of its own where it is needed. Friction is
+differ by (k_s/K) b_i and contain the same information; but which combination has little noise
+depends on the truck, and each form isolates it where it is needed. Friction is
 correlated over a tenth of a second; the Bohman window, which keeps its covariance positive,
 truncates this, so that the residuals' covariance vanishes beyond it and the filter's length.
 
@@ -342,7 +342,7 @@ def mismatch_levels(
     The statistic is that of their likelihood over zero (`whittle`); the third value holds the
     levels (s,) of the declared axles on a surface as rough as the road.
 
-    Each segment (m,) is of consecutive filtered residuals without effect of a bridge; `roads` are
+    Each segment (m,) has consecutive filtered residuals unaffected by a bridge; `roads` are
     residuals of one axle's profile there, treated as the front one, which bound an axle's offset.
     """
     omega, shapes = rows.omega, road.shapes
@@ -438,7 +438,7 @@ def noise_power_ratio(
 def suspension_equation_weight(
     rows: RowFilter, truck: NoisePath, density: FloatArray, force: FloatArray
 ) -> float:
-    """Return the weight of the suspension equations: the mean share (0 to 1) of sensor noise.
+    """Return the suspension equations' weight: sensor noise's mean share (0 to 1) of all noise.
 
     `density` (4,) is that of the sensors, `force` (2, shapes) the suspension noise in N²/Hz.
     """

@@ -6,8 +6,8 @@ bridge placed half a metre too far fits almost as well with other rigidities. So
     1. finds truck and trajectory while the bridge may change only as a whole, with a noise far
        above the actual one, reduced step by step;
     2. scans longitudinal offsets of the bridge (`walk`);
-    3. fits all parameters (`fit`) from the best offset, and from the next best ones if that does
-       not fit, unless it fits so badly that none would.
+    3. fits all parameters (`fit`) from the best offset, and from the next best ones if that fit is
+       poor but not hopeless.
 
 If the result is a misfit because of hum, the search is repeated without the hum (`lines`).
 """

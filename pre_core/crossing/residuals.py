@@ -7,7 +7,7 @@ n with that under the front wheel at the same place; the front body equation is 
 time too, so that the noise of all three is in phase. All of it happens at the model's own rate
 (channels.py), in which every signal is smooth; the residuals are then whitened (whitening.py).
 
-Longer than other modules: an evaluation is a chain of kernels over the same work arrays, and numba
+This module is long: an evaluation is a chain of kernels over the same work arrays, and numba
 notices a changed kernel only in the same file.
 """
 
@@ -216,7 +216,7 @@ def _wheels(
     gravity: float,
     speeding: FloatArray,
 ) -> None:
-    """Compute minus the profile (`road`), `load` and `body`; `gravity` is over the common gain."""
+    """Compute `road` (minus the profile), `load`, `body`; `gravity` is divided by common gain."""
     m_s = crossing.total_mass_kg - theta[M_U1] - theta[M_U1 + 1]
     m_11, m_22, m_12 = masses_above_axles(m_s, theta[D_1], wheelbase, theta[KAPPA])
     on_axles = masses_on_axles(m_s, theta[D_1], wheelbase, theta[M_U1], theta[M_U1 + 1])

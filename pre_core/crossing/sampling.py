@@ -67,8 +67,8 @@ def sample(
 ) -> PosteriorDraws:
     """Draw from the posterior about its optimum, for noise `inflation` times the declared one.
 
-    Return at least `draws` in all chains together; STEPS_EXHAUSTED without convergence. Improbable
-    torsion is omitted: zero in all draws.
+    Return at least `draws` in all chains together; it ends with STEPS_EXHAUSTED if not converged.
+    Improbable torsion is zero in all draws.
     """
     if found.problem.mismatch.level_m3.any():
         return _mismatch_draws(found, draws, seed, inflation)

@@ -1,9 +1,9 @@
 """Detection of a disturbance common to all sensors that is not vertical motion.
 
 Sensors mounted off the vertical by an angle measure its sine times the longitudinal or lateral
-acceleration, all equally. The strokes of the springs do not contain it, the inertia of the body
-does: it appears in both body equations at the same time. Residuals of friction and dampers are
-specific to each axle.
+acceleration, all equally. It is absent from the spring strokes but acts on the body's inertia: it
+appears in both body equations at the same time. Residuals of friction and dampers are specific to
+each axle.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Tables that interpolate a crossing's signals between samples, and a wheel's step on a bearing."""
+"""Tables to interpolate signals between samples, and the force step of a wheel on a bearing."""
 
 import numpy as np
 from numpy.typing import NDArray

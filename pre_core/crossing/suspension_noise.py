@@ -11,10 +11,10 @@ noise would decrease with it: a bias that can be corrected only as well as its l
 known. (Friction of 2 to 10 %: EI 0.4 standard deviations too low.) With full weight the divisor is
 the stiffness: the sensor noise is known."""
 REDUCED_WEIGHT_FACTOR = 100.0
-"""Factor of the suspension noise where its weight is reduced. It is not noise: it follows the
-truck's motion, and could pass for a heavier end or another centre of gravity. Without the factor EI
-was 0.34 standard deviations too low (the median of 36 crossings with friction) and the coverage 93
-%; with it 0.09 and 97 %, with intervals of the same width."""
+"""Factor of the suspension noise where the equations' weight is reduced. Friction is not noise: it
+follows the truck's motion, and could pass for a heavier end or another centre of gravity. Without
+the factor EI was 0.34 standard deviations too low (the median of 36 crossings with friction) and
+the coverage 93 %; with it 0.09 and 97 %, with intervals of the same width."""
 _FORCE_CENTRES_HZ = np.arange(0.0, 60.0, 4.0)
 FORCE_SHAPES = _FORCE_CENTRES_HZ.size
 """Number of basis functions, a few hertz wide, in the spectrum of the suspension noise: that of dry

@@ -78,9 +78,9 @@ def wheels(
     """Compute minus the profile (`road`) and `load` of the tandem, and the front axle's `load`.
 
     For theta (p,) and accelerations `speeding` (n,) of the truck. `body` is zero, except the second
-    one of a tandem with springs of its own: the part of the body's moment about the front axle that
-    they do not carry, over its lever. The front spring's lower end is not measured. `gravity` is
-    over the common gain.
+    one of a tandem with springs of its own: the moment about the front axle that the springs do not
+    carry, divided by its lever. The front spring's lower end is not measured. `gravity` is divided
+    by the common gain.
     """
     lead = crossing.lead
     on = shared_load(lead, theta, crossing.total_mass_kg, gap)

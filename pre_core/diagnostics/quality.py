@@ -120,8 +120,8 @@ def spikes(values: FloatArray, height: float = 20.0) -> int:
     """Return the number of single samples (n,) that deviate from smooth neighbours.
 
     A sample's distance from the cubic through its four nearest neighbours counts if it is more than
-    `height` times the typical one, and if the two nearest lie within a seventh of it of the cubic
-    through the others: a kink or step, as an impact causes, is not a single sample.
+    `height` times the typical one, and if the two nearest are within a seventh of that distance
+    from the others' cubic: a kink or step, as an impact causes, is not a single sample.
     """
     if values.size < 9:
         return 0

@@ -90,7 +90,7 @@ class Change(NamedTuple):
     since: int
     """Number of the period in which it most likely began."""
     sum: float
-    """Chart's statistic when raised, in standard deviations like `MonitoringResult.threshold`."""
+    """Chart's statistic at the alarm, in standard deviations like `MonitoringResult.threshold`."""
     ratio: FloatArray  # (n,) EI now over EI before, of every element
     low: FloatArray
     """Lower ends (n,) of its 95 % intervals; `high` are the upper ones."""

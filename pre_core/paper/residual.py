@@ -1,10 +1,10 @@
 """The paper's residual: the road under the front wheel less the road under the rear wheel.
 
-r_i = u_i - y_i (IEP less DRS) at each wheel; R_1(x) - R_2(x) vanishes for the right parameters, and
-J = integral of (R_1 - R_2)^2 dx (paper eq. 21). A `PaperWindow` holds everything that does not
-depend on the parameters.
+r_i = u_i - y_i (input less deflection) at each wheel; R_1(x) - R_2(x) vanishes for the right
+parameters, and J = integral of (R_1 - R_2)^2 dx (paper eq. 21). A `PaperWindow` holds everything
+that does not depend on the parameters.
 
-Longer than other modules: J of four vectors, J of one, residuals and roads share the work arrays,
+This module is long: J of four vectors, J of one, residuals and roads share the work arrays,
 and numba notices a changed kernel only in the same file.
 """
 
