@@ -94,7 +94,7 @@ def compliance_posterior(found: Optimum, inflation: float) -> CompliancePosterio
 def without_priors(
     problem: PosteriorProblem, rows: int, places: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return the indices (m,) of `rows` residuals except priors of coordinates `places` of y."""
+    """Return indices (m,) among `rows` residuals, without the priors at `places` of y."""
     # The priors' residuals come last, in the order of y up to the trajectory.
     return np.setdiff1d(np.arange(rows), rows - layout(problem).trajectory.start + places)
 

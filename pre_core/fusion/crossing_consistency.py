@@ -46,7 +46,7 @@ class ConsistencyResult(NamedTuple):
     agree: tuple[str, ...]
     left_out: tuple[str, ...]
     disagree: bool
-    """Whether the kept ones contradict each other, too few to find the wrong one."""
+    """Whether the kept ones contradict each other and are too few to find the wrong one."""
 
 
 def select_consistent(

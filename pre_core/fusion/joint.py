@@ -7,7 +7,7 @@ element's compliance: between crossings EI varies with temperature and with effe
 lacks, by a relative standard deviation tau of which a share rho is common to all elements. Normal
 variables are integrated out; tau and rho are evaluated on a grid.
 
-Longer than other modules: all of it uses one layout of all coordinates.
+This module is long: all of it uses one layout of all coordinates.
 """
 
 from collections.abc import Collection, Sequence
@@ -95,9 +95,9 @@ def sample_joint(
 def build_joint(
     parts: Sequence[FusionInput], priors: BridgePriors, consistent: Collection[str] | None = None
 ) -> JointInformation:
-    """Return crossings with their own variables integrated out, except the bridge's change.
+    """Return crossings with all own variables but the bridge's change integrated out.
 
-    Changes are relative to the estimate from all, or from the `consistent` of them by name.
+    Changes are relative to the estimate from all crossings, or from those named in `consistent`.
     """
     parts = sorted(parts, key=lambda part: part.name)
     tracks = path_groups(parts)
