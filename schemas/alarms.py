@@ -53,8 +53,8 @@ class Alarm(StrictModel):
         ends = sorted(100.0 * abs(1.0 - end) for end in (self.ratio_q025, self.ratio_q975))
         return (
             f"element {self.element} is {change:.0f} % {how} than before "
-            f"{datetime.fromtimestamp(self.since, UTC):%Y-%m-%d}, "
-            f"interval {ends[0]:.0f} to {ends[1]:.0f} %"
+            f"{datetime.fromtimestamp(self.since, UTC):%Y-%m-%d} "
+            f"(95 % interval {ends[0]:.0f} to {ends[1]:.0f} %)"
         )
 
 

@@ -96,8 +96,8 @@ def estimate(crossing: CrossingResult) -> BusMessage:
 
 
 WEAK_FINDING = (
-    "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements, "
-    "interval 57 to 62 %. No other element differs clearly (estimates within 3 %); "
+    "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements "
+    "(95 % interval 57 to 62 %). No other element differs clearly (estimates within 3 %); "
     "a 16 % loss of any would show."
 )
 
@@ -195,9 +195,9 @@ def a_fleet(site: Site) -> RealmModel:
         finding = quiet.format(2 + number)
         if is_weak:
             finding = (
-                "Element 4, 12.9 to 17.1 m: 20 % less stiff than the other elements, "
-                "interval 16 to 24 %. No other element differs clearly (estimates within 3 %); "
-                "a 14 % loss of any would show."
+                "Element 4, 12.9 to 17.1 m: 20 % less stiff than the other elements "
+                "(95 % interval 16 to 24 %). No other element differs clearly (estimates within "
+                "3 %); a 14 % loss of any would show."
             )
         of = {"bridge": bridge, "ratios": ratios}
         who = f"truck-{number % 3 + 1}"
