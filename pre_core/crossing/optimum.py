@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pre_core.crossing.comparison import is_better
 from pre_core.crossing.fit import (
     FAR_OFF_CHI2,
     HOPELESS_CHI2,
@@ -322,7 +323,7 @@ def _fit_candidates(
             found, used = _refine_offset(found, strategy, budget.evaluations - evaluations)
             evaluations += used
         last_chi2 = np.inf if best is None else best.chi2_per_dof
-        if best is None or found.chi2_per_dof < best.chi2_per_dof:
+        if best is None or is_better(found, best):
             best = found
         is_last = len(tried) == strategy.max_candidates or evaluations > budget.evaluations
         if is_last or _is_last_offset(best, found, last_chi2, len(tried)):
@@ -387,9 +388,8 @@ def _with_free_ends(found: Optimum, strategy: SearchStrategy) -> tuple[Optimum, 
     """
     where, y = layout(found.problem), found.state.y
     ends = np.intersect1d(where.half_normal, where.bridge)
-    is_restrained = np.any(y[ends] > _CLEAR_RESTRAINT)
-    is_finished = found.unfinished is None
-    if not (is_restrained and is_finished) or found.chi2_per_dof > HOPELESS_CHI2:
+    is_restrained = found.unfinished is None and np.any(y[ends] > _CLEAR_RESTRAINT)
+    if not is_restrained or found.chi2_per_dof > HOPELESS_CHI2:
         return found, 0
     start = y.copy()
     start[where.bridge] = 0.0
@@ -397,7 +397,7 @@ def _with_free_ends(found: Optimum, strategy: SearchStrategy) -> tuple[Optimum, 
     if other is None:
         return found, used
     other = complete_fit(other)
-    return (other if other.chi2_per_dof < found.chi2_per_dof else found), other.evaluations
+    return (other if is_better(other, found) else found), other.evaluations
 
 
 def _refine_offset(
@@ -416,7 +416,7 @@ def _refine_offset(
             found.problem, shifted_to(found.problem, found.state.y, place), strategy
         )
         evaluations += used
-        if other is None or other.chi2_per_dof >= found.chi2_per_dof:
+        if other is None or not is_better(other, found):
             break
         found = other
     return found, evaluations

@@ -10,7 +10,8 @@ from scipy.interpolate import BSpline
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing import channels
 from pre_core.crossing.channels import channel_signals
-from pre_core.crossing.fit import Optimum, chi2_per_dof
+from pre_core.crossing.comparison import is_better, minus_two_log_posterior
+from pre_core.crossing.fit import Optimum, chi2_per_dof, is_accepted
 from pre_core.crossing.misfit import fit_off_bridge
 from pre_core.crossing.posterior import (
     ChainageFixes,
@@ -470,3 +471,46 @@ def optimum_at(problem: PosteriorProblem, y: FloatArray) -> Optimum:
     """A search that ended at y, which need be no minimum."""
     state = levenberg_marquardt.initial_state(lambda at: all_rows(problem, at), y)
     return Optimum(problem, state, Termination.CONVERGED, chi2_per_dof(problem, y), 0, 1)
+
+
+def louder(found: Optimum, factor: float) -> Optimum:
+    """The same point, judged by a noise `factor` times as large."""
+    noise = found.problem.noise
+    noise = noise._replace(factor=noise.factor * factor, reciprocal=noise.reciprocal / factor)
+    return optimum_at(found.problem._replace(noise=noise), found.state.y)
+
+
+def test_a_wrong_bridge_under_more_noise_is_no_better_fit(here: Case) -> None:
+    """Chi2 prefers it, because its noise explains what its bridge does not."""
+    right = optimum_at(here.problem, here.y)
+    y = here.y.copy()
+    y[layout(here.problem).elements[0]] += 0.1
+    wrong = louder(optimum_at(here.problem, y), 1.3)
+    assert wrong.chi2_per_dof < right.chi2_per_dof
+    assert is_accepted(wrong.problem, wrong.chi2_per_dof)
+    assert is_better(right, wrong)
+    assert not is_better(wrong, right)
+
+
+def test_forces_of_another_form_are_compared_by_chi2(here: Case) -> None:
+    right = optimum_at(here.problem, here.y)
+    other = louder(right, 1.3)
+    crossing = other.problem.crossing
+    crossing = crossing._replace(is_inertial=not crossing.is_inertial)
+    other = other._replace(problem=other.problem._replace(crossing=crossing))
+    assert is_better(other, right)
+
+
+def test_log_posterior_has_the_normalisation_of_the_noise(here: Case) -> None:
+    found = optimum_at(here.problem, here.y)
+    data = data_rows(here.problem, here.y[None, :])[0]
+    change = minus_two_log_posterior(louder(found, 2.0)) - minus_two_log_posterior(found)
+    expected = 2.0 * data.size * np.log(2.0) - 0.75 * float(data @ data)
+    assert change == pytest.approx(expected, rel=1e-9)
+    y = here.y.copy()
+    y[D_1] += 1.0
+    moved = optimum_at(here.problem, y)
+    rows = data_rows(here.problem, y[None, :])[0]
+    change = minus_two_log_posterior(moved) - minus_two_log_posterior(found)
+    prior = y[D_1] ** 2 - here.y[D_1] ** 2
+    assert change == pytest.approx(float(rows @ rows) - float(data @ data) + prior, rel=1e-9)

@@ -18,6 +18,14 @@ BUDGET = optimum._Budget(evaluations=1000, chi2=fit.WORTH_COMPLETING_CHI2)
 STRATEGY = fit.SearchStrategy(0, False, 4, False)
 
 
+@pytest.fixture(autouse=True)
+def compared_by_chi2(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stand-ins have no posterior density."""
+    monkeypatch.setattr(
+        optimum, "is_better", lambda one, other: one.chi2_per_dof < other.chi2_per_dof
+    )
+
+
 def found(chi2: float, evaluations: int, ending: Termination = Termination.CONVERGED) -> Any:
     """A stand-in for an optimum, as the choice among them sees it."""
     unknown: Any = SimpleNamespace(

@@ -1,0 +1,46 @@
+"""Comparison of two optima of one crossing.
+
+Chi2 shows whether a fit explains the residuals by its own noise, and not which of two fits is
+likelier: levels of mismatch and suspension noise follow from the residuals, so that a wrong bridge
+with more noise has a chi2 of one, too. Two accepted fits are therefore compared by their posterior
+densities, which contain the normalisation of the noise.
+"""
+
+import numpy as np
+
+from pre_core.crossing.fit import Optimum, is_accepted
+from pre_core.crossing.posterior import data_rows, layout
+
+
+def is_better(one: Optimum, other: Optimum) -> bool:
+    """Return whether an optimum is better than another one of the same crossing.
+
+    Misfits, and fits with forces of different form (from inertia or from springs), whose residuals
+    are not the same quantities, are compared by chi2.
+    """
+    if _is_comparable(one, other):
+        return minus_two_log_posterior(one) < minus_two_log_posterior(other)
+    return one.chi2_per_dof < other.chi2_per_dof
+
+
+def minus_two_log_posterior(found: Optimum) -> float:
+    """Return -2 ln of the posterior density at an optimum, up to a constant of its crossing.
+
+    The whitener W has W'W = C^-1, so that the normalisation is ln |C| = -2 ln |W|.
+    """
+    problem, y = found.problem, found.state.y
+    where = layout(problem)
+    data = data_rows(problem, y[None, :])[0]
+    receiver = problem.receiver_rows @ y[where.trajectory.start : where.offset + 1]
+    receiver -= problem.receiver_values
+    priors = y[: where.trajectory.start]
+    squares = float(data @ data) + float(receiver @ receiver) + float(priors @ priors)
+    return squares - 2.0 * float(np.log(problem.noise.reciprocal).sum())
+
+
+def _is_comparable(one: Optimum, other: Optimum) -> bool:
+    return (
+        one.problem.crossing.is_inertial == other.problem.crossing.is_inertial
+        and one.problem.lines_hz == other.problem.lines_hz
+        and all(is_accepted(each.problem, each.chi2_per_dof) for each in (one, other))
+    )
