@@ -60,6 +60,7 @@ def test_faults_runs_everything_but_the_soak(project: Path) -> None:
     assert {name.partition("::")[2].partition("[")[0] for name in soak} == {
         "test_killed_fifty_times",
         "test_an_hour_at_the_rated_load",
+        "test_truck_silent_for_over_an_hour_is_fetched_from_its_spool",
     }
     assert not faults & soak
     assert faults | soak == every
