@@ -9,7 +9,7 @@ densities, which contain the normalisation of the noise.
 import numpy as np
 
 from pre_core.crossing.fit import Optimum, is_accepted
-from pre_core.crossing.posterior import data_rows, layout
+from pre_core.crossing.posterior import all_rows
 
 
 def is_better(one: Optimum, other: Optimum) -> bool:
@@ -26,16 +26,12 @@ def is_better(one: Optimum, other: Optimum) -> bool:
 def minus_two_log_posterior(found: Optimum) -> float:
     """Return -2 ln of the posterior density at an optimum, up to a constant of its crossing.
 
-    The whitener W has W'W = C^-1, so that the normalisation is ln |C| = -2 ln |W|.
+    The whitener W has W'W = C^-1, so that the normalisation is ln |C| = -2 ln |W|. `noise_slope`,
+    its gradient in a search with fixed noise, is left out.
     """
-    problem, y = found.problem, found.state.y
-    where = layout(problem)
-    data = data_rows(problem, y[None, :])[0]
-    receiver = problem.receiver_rows @ y[where.trajectory.start : where.offset + 1]
-    receiver -= problem.receiver_values
-    priors = y[: where.trajectory.start]
-    squares = float(data @ data) + float(receiver @ receiver) + float(priors @ priors)
-    return squares - 2.0 * float(np.log(problem.noise.reciprocal).sum())
+    problem = found.problem
+    (rows,) = all_rows(problem._replace(noise_slope=np.zeros(0)), found.state.y[None, :])
+    return float(rows @ rows) - 2.0 * float(np.log(problem.noise.reciprocal).sum())
 
 
 def _is_comparable(one: Optimum, other: Optimum) -> bool:

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 from schemas.reasons import LEFT_OUT_TEXTS, BridgeReason
-from schemas.results import BridgeResult, ElementState, Parameter
+from schemas.results import BridgeResult, ElementState, Parameter, Thirds, ThirdsState
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -53,12 +53,17 @@ def print_bridge(console: "Console", bridge: BridgeElements, state: BridgeResult
         console.print(line, highlight=False)
 
 
+def level_lines(level: Parameter | ElementState, thirds: Thirds | ThirdsState) -> Iterator[str]:
+    """Yield the overall stiffness and that of the thirds, with their standard deviations."""
+    parts = (thirds.left, thirds.middle, thirds.right)
+    yield f"overall stiffness: {level.mean:.2f} ± {level.std:.2f} of nominal"
+    listed = ", ".join(f"{part.mean:.2f} ± {part.std:.2f}" for part in parts)
+    yield f"thirds of the span: {listed} (standard deviations)"
+
+
 def _of_state(state: BridgeResult) -> Iterator[str]:
     if state.level is not None and state.thirds is not None:
-        thirds = (state.thirds.left, state.thirds.middle, state.thirds.right)
-        parts = ", ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
-        yield f"overall stiffness: {state.level.mean:.2f} ± {state.level.std:.2f} of nominal"
-        yield f"thirds of the span: {parts} (standard deviations)"
+        yield from level_lines(state.level, state.thirds)
     if state.between_crossing_std is not None and len(state.crossings_used) == 1:
         yield (
             "single crossing: intervals include the between-crossing variability, which one "

@@ -21,7 +21,7 @@ from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Site
 from schemas.validation_records import VehicleBridgePair
 from services.catalogue.contents import summarise_recording
-from services.cli.bridge_table import print_bridge, print_elements
+from services.cli.bridge_table import level_lines, print_bridge, print_elements
 from services.cli.settings import IdentifyOptions
 from services.common.errors import FailureError, InputError
 from services.common.files import (
@@ -311,11 +311,7 @@ def _level_lines(crossing: CrossingResult) -> Iterator[str]:
     """Describe level and thirds of EI, and the mismatch of the road profiles."""
     derived = crossing.derived
     if derived is not None and derived.ei_level is not None and derived.ei_thirds is not None:
-        thirds = (derived.ei_thirds.left, derived.ei_thirds.middle, derived.ei_thirds.right)
-        parts = ", ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
-        level = derived.ei_level
-        yield f"overall stiffness: {level.mean:.2f} ± {level.std:.2f} of nominal"
-        yield f"thirds of the span: {parts} (standard deviations)"
+        yield from level_lines(derived.ei_level, derived.ei_thirds)
     if crossing.road is not None and crossing.road.mismatch is not None:
         mismatch = crossing.road.mismatch
         yield (

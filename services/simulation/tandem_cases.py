@@ -10,14 +10,13 @@ import numpy as np
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from services.simulation.two_sided import WideAxle, WideBogie, WideTruck, static_axle_loads_n
-from services.simulation.two_sided_deck import Deck
 from services.simulation.wide_cases import (
     SINGLE,
     TWIN,
     WANDER_M,
-    WEAK,
     declared_bridge,
     disturbed,
+    draw_beam,
     rigid_body,
     with_errors,
 )
@@ -63,21 +62,9 @@ def draw_tandem(seed: int, options: TandemOptions = USUAL) -> WideCase:
     rng = np.random.default_rng(np.random.SeedSequence([seed, 0x7A2D]))
     u = rng.uniform
     truck = tandem_truck_of(rng, options)
-    span = round(float(u(*options.span_m)), 1)
-    elements = 5 if span < 26.0 else 7
-    mass = 4400.0 * float(np.sqrt(span / 30.0) * u(0.8, 1.25))
-    rigidity = mass * (2.0 * float(u(90.0, 115.0)) * span / np.pi) ** 2
-    ratios = np.ones(elements)
-    is_weak, element, weak = u() < 0.7, int(rng.integers(elements)), u(*WEAK)
-    if is_weak:
-        ratios[element] = weak
-    deck = Deck(
-        span,
-        tuple((rigidity * ratios).tolist()),
-        mass,
-        float(0.7 * np.exp(0.2 * rng.standard_normal())),
-        float(0.005 * np.exp(0.2 * rng.standard_normal())),
-    )
+    plain, ratios = draw_beam(rng, options.span_m, fewest_below_m=26.0, weak_share=0.7)
+    rigidity = plain.flexural_rigidity_nm2[0]
+    deck = plain._replace(flexural_rigidity_nm2=tuple((rigidity * ratios).tolist()))
     runs = tuple(
         WideRun(
             float(u(*SPEED_M_PER_S)),
@@ -94,7 +81,7 @@ def draw_tandem(seed: int, options: TandemOptions = USUAL) -> WideCase:
         seed,
         truck,
         deck,
-        float(rigidity),
+        rigidity,
         0.0,
         options.road_class,
         int(rng.integers(1 << 31)),
@@ -105,7 +92,7 @@ def draw_tandem(seed: int, options: TandemOptions = USUAL) -> WideCase:
             "vehicle": declared_tandem(
                 truck, sensors, rng, equalised=options.equalised or not options.is_declared
             ),
-            "bridge": declared_bridge(deck, float(rigidity), rng),
+            "bridge": declared_bridge(deck, rigidity, rng),
             "sensor": {"rate_hz": 500.0},
         },
     )

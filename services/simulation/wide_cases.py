@@ -79,7 +79,7 @@ def draw_wide(
     truck = two_axle_truck(
         float(u(*TOTAL_MASS_KG)), float(u(*WHEELBASE_M)), float(u(*FRONT_SHARE)), tyres, rng
     )
-    plain, ratios = _draw_beam(rng)
+    plain, ratios = draw_beam(rng, SPAN_M, fewest_below_m=24.0, weak_share=0.5)
     rigidity = plain.flexural_rigidity_nm2[0]
     f_1 = float(bending_frequencies_hz(plain, 1)[0])
     ratio, gyration = float(u(*TORSIONAL_RATIO)), float(u(*GYRATION_M))
@@ -116,15 +116,25 @@ def draw_wide(
     )
 
 
-def _draw_beam(rng: np.random.Generator) -> tuple[Deck, NDArray[np.float64]]:
-    """Draw an undamaged deck that does not twist, and the ratios (n,) of the damaged EI to it."""
+def draw_beam(
+    rng: np.random.Generator,
+    span_m: tuple[float, float],
+    *,
+    fewest_below_m: float,
+    weak_share: float,
+) -> tuple[Deck, NDArray[np.float64]]:
+    """Draw an undamaged deck that does not twist, and the ratios (n,) of the damaged EI to it.
+
+    Spans below `fewest_below_m` have five elements, others seven; with probability `weak_share` one
+    element is weak.
+    """
     u = rng.uniform
-    span = round(float(u(*SPAN_M)), 1)
-    elements = 5 if span < 24.0 else 7
+    span = round(float(u(*span_m)), 1)
+    elements = 5 if span < fewest_below_m else 7
     mass = 4400.0 * float(np.sqrt(span / 30.0) * u(0.8, 1.25))
     rigidity = mass * (2.0 * float(u(90.0, 115.0)) * span / np.pi) ** 2
     ratios = np.ones(elements)
-    is_weak, element, weak = u() < 0.5, int(rng.integers(elements)), u(*WEAK)
+    is_weak, element, weak = u() < weak_share, int(rng.integers(elements)), u(*WEAK)
     if is_weak:
         ratios[element] = weak
     alpha, beta = (

@@ -200,8 +200,7 @@ def road_under(
 
     With one road every tyre follows the same line, averaged over the first axle's contact length.
     """
-    spacing_m = _ROAD_SPACING_M
-    count = round((stop_m - start_m) / spacing_m) + 1
+    count = round((stop_m - start_m) / _ROAD_SPACING_M) + 1
     sign = 1.0 if forward else -1.0
     strips = []
     tyres = tyres_of(truck)
@@ -211,8 +210,8 @@ def road_under(
         strips.append(Strip(place, axle.tyre_width_m, axle.contact_length_m))
     if is_one_road:
         strips = [Strip(0.0, 0.0, truck.axles[0].contact_length_m)] * len(strips)
-    felt = {s: heights_m(waves, s, start_m, spacing_m, count) for s in dict.fromkeys(strips)}
-    return WideRoad(start_m, spacing_m, np.stack([felt[strip] for strip in strips]))
+    felt = {s: heights_m(waves, s, start_m, _ROAD_SPACING_M, count) for s in dict.fromkeys(strips)}
+    return WideRoad(start_m, _ROAD_SPACING_M, np.stack([felt[strip] for strip in strips]))
 
 
 def sensor_row(truck: WideTruck, sensor: WideSensor) -> Floats:

@@ -15,10 +15,10 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
+from tests.builders.commands import Ended
 from tests.containers import s3_server
 from tests.containers.s3_server import S3Server
 from tests.drives import drives
@@ -29,14 +29,6 @@ pytestmark = [pytest.mark.containers, pytest.mark.process, pytest.mark.timeout(3
 COMMAND = "import sys; from services.cli.main import main; sys.exit(main(sys.argv[1:]))"
 QUICK = ("--method", "least-squares")
 LARGE_BYTES = 1_000_000_000
-
-
-class Ended(NamedTuple):
-    """The end of a command."""
-
-    code: int
-    out: str
-    err: str
 
 
 def run(*words: object, env: dict[str, str]) -> Ended:
