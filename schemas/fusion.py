@@ -50,11 +50,15 @@ class Bends(StrictModel):
     about: tuple[Finite, ...]
     """Values of the bridge's x at the optimum of this crossing, from which the moves count; shape
     (b,)."""
-    size: tuple[Annotated[Finite, Field(gt=0)], ...]
-    """Units of the moves: of the b bridge parameters, and in m of the offset."""
+    size: tuple[Annotated[Finite, Field(gt=0)], ...] = ()
+    """Units of moves of single coordinates: of the b bridge parameters, and in m of the offset.
+    Empty but in results from before the directions."""
     shapes: tuple[Finite, ...]
     """Factors of all products of two moves, i <= j row by row, one curvature term after the other.
     """
+    directions: tuple[Finite, ...] = ()
+    """Matrix (b + 1, b + 1), row by row, whose columns are the moves of unit size; empty where they
+    are those of single coordinates."""
 
 
 class FusionLikelihood(StrictModel):
@@ -94,9 +98,12 @@ class FusionLikelihood(StrictModel):
         """Return the number of coordinates of the curvature terms, with the offset."""
         if self.bends is None:
             return 0
-        moves = len(self.bends.size)
-        if len(self.bends.about) != len(self.bridge) or moves != len(self.bridge) + 1:
+        moves = len(self.bridge) + 1
+        if len(self.bends.about) != moves - 1:
             raise ValueError("bends must be of the bridge's coordinates and the place")
+        given = (len(self.bends.size), len(self.bends.directions))
+        if given not in ((moves, 0), (0, moves**2)):
+            raise ValueError(f"bends must have {moves} sizes or {moves**2} numbers of directions")
         count, left = divmod(len(self.bends.shapes), moves * (moves + 1) // 2)
         if left:
             raise ValueError("shapes must have a factor for each product of two moves")

@@ -163,9 +163,9 @@ def likelihood(found: Optimum, *, with_bends: bool = True) -> CrossingLikelihood
         kept = np.concatenate([kept, centre.size + inner])
         centre = np.concatenate([centre, np.zeros(grid.size)])
     if differs and with_bends:
-        bends, bent = curvature_terms(found, problem, rows)
         # The whole trajectory relative to the optimum, and its other coordinates relative to that.
-        place = where.trajectory.start
+        place = (where.trajectory.start + where.trajectory.stop) // 2
+        bends, bent = curvature_terms(found, problem, rows, place)
         jacobian[:, place] = jacobian[:, where.trajectory].sum(axis=1)
         centre[where.trajectory] = 0.0
         jacobian = np.hstack([jacobian, bent])
@@ -234,7 +234,8 @@ def in_coordinates(
     bends = crossing.bends
     if bends is not None:
         bends = bends._replace(
-            about=(bends.about - aside) / factor, size=bends.size / np.append(factor, 1.0)
+            about=(bends.about - aside) / factor,
+            directions=bends.directions / np.append(factor, 1.0)[:, None],
         )
     return crossing._replace(root=root, target=target, bridge=coordinates, bends=bends)
 

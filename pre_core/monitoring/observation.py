@@ -47,7 +47,7 @@ class Observation(NamedTuple):
 def observation(
     part: FusionInput, priors: BridgePriors, ei_nm2: FloatArray, common_share: float
 ) -> Observation:
-    """Return a crossing's observation, linearised about its rigidities (n,).
+    """Return a crossing's observation, relative to its rigidities (n,).
 
     `common_share` is the shared fraction of the power of its mismatch's long waves in the
     wheel-path group.
@@ -60,7 +60,7 @@ def observation(
     track = path_groups([part]).get(path_group_key(part))
     waves = np.zeros((0, 0)) if track is None else track.whole
     if of.bends is not None:
-        of = linearised_likelihood(of, centre, waves)
+        of = linearised_likelihood(of, of.bends.about, waves)
     precision, linear = add_mass_parameter(of, part.mass_spread, priors, centre)
     x = np.arange(b - n, b)
     v = np.setdiff1d(np.arange(linear.size), x)

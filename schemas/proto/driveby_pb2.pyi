@@ -308,14 +308,16 @@ class Stretch(_message.Message):
     def __init__(self, begin_m: _Optional[float] = ..., step_m: _Optional[float] = ..., values: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Bends(_message.Message):
-    __slots__ = ("about", "size", "shapes")
+    __slots__ = ("about", "size", "shapes", "directions")
     ABOUT_FIELD_NUMBER: _ClassVar[int]
     SIZE_FIELD_NUMBER: _ClassVar[int]
     SHAPES_FIELD_NUMBER: _ClassVar[int]
+    DIRECTIONS_FIELD_NUMBER: _ClassVar[int]
     about: _containers.RepeatedScalarFieldContainer[float]
     size: _containers.RepeatedScalarFieldContainer[float]
     shapes: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, about: _Optional[_Iterable[float]] = ..., size: _Optional[_Iterable[float]] = ..., shapes: _Optional[_Iterable[float]] = ...) -> None: ...
+    directions: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, about: _Optional[_Iterable[float]] = ..., size: _Optional[_Iterable[float]] = ..., shapes: _Optional[_Iterable[float]] = ..., directions: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class FusionLikelihood(_message.Message):
     __slots__ = ("bridge", "truck", "root", "target", "element_lengths_m", "mass_spread", "footprints", "first_knot_m", "knot_spacing_m", "level_m3", "off_bridge_m", "bends")

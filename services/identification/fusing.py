@@ -81,7 +81,8 @@ def _stored_bends(of: CurvatureTerms | None) -> fusion.Bends | None:
     if of is None:
         return None
     shapes = tuple(float(f"{value:.{_DIGITS_OF_BENDS}e}") for value in of.shapes.ravel())
-    return fusion.Bends(about=_rounded(of.about), size=_rounded(of.size), shapes=shapes)
+    directions = _rounded(of.directions.ravel())
+    return fusion.Bends(about=_rounded(of.about), directions=directions, shapes=shapes)
 
 
 def _rounded(values: Floats) -> tuple[float, ...]:
@@ -266,9 +267,12 @@ def _knots(of: fusion.FusionLikelihood, m: int) -> Floats:
 def _bends(of: fusion.FusionLikelihood) -> CurvatureTerms | None:
     if of.bends is None:
         return None
-    moves = len(of.bends.size)
+    moves = len(of.bridge) + 1
     shapes = np.array(of.bends.shapes).reshape(-1, moves * (moves + 1) // 2)
-    return CurvatureTerms(np.array(of.bends.about), np.array(of.bends.size), shapes)
+    directions = np.array(of.bends.directions).reshape(-1, moves)
+    if of.bends.size:
+        directions = np.diag(of.bends.size)
+    return CurvatureTerms(np.array(of.bends.about), directions, shapes)
 
 
 def _off_bridge(of: fusion.FusionLikelihood) -> of_crossing.OffBridgeMismatch | None:

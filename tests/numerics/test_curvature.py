@@ -1,27 +1,43 @@
-"""Likelihoods of which the rows are bent: normal again about a point."""
+"""Likelihoods with curvature terms: normal again about a point, and true to the residuals."""
+
+from functools import partial
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from pre_core.fusion.curvature import CurvatureTerms, linearise_with_curvature
+from pre_core.crossing import posterior
+from pre_core.crossing.fit import Optimum, normal_approximation
+from pre_core.fusion.curvature import CurvatureTerms, curvature_terms, linearise_with_curvature
+from pre_core.search import levenberg_marquardt
+from pre_core.search.loop import Termination
+from schemas.settings import IdentificationSettings
+from services.simulation.data_alone import crossing_data_only
+from services.simulation.drawn import default_site, drive
+from services.simulation.survey_kinds import KINDS
+from studies.validation.bound import at_truth
+from studies.validation.surveys import crossing_truth, site_of_truck
 
 FloatArray = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 BRIDGE, OTHERS, ROWS = 3, 2, 12
 ABOUT = np.array([0.2, 1.0, 0.7])
-SIZE = np.array([0.5, 0.3, 0.2, 0.4])
+DIRECTIONS = np.array(
+    [[0.5, 0.0, 0.1, 0.0], [0.0, 0.3, 0.0, 0.1], [0.1, 0.2, 0.2, 0.0], [0.0, 0.1, 0.0, 0.4]]
+)
 PAIRS = np.triu_indices(BRIDGE + 1)
 
 
-def bends(rng: np.random.Generator) -> CurvatureTerms:
-    return CurvatureTerms(ABOUT, SIZE, rng.standard_normal((2, PAIRS[0].size)))
+def terms(rng: np.random.Generator) -> CurvatureTerms:
+    return CurvatureTerms(ABOUT, DIRECTIONS, rng.standard_normal((2, PAIRS[0].size)))
 
 
 def rows(
     root: FloatArray, of: CurvatureTerms, bridge: FloatArray, others: FloatArray, place: float
 ) -> FloatArray:
-    """What a bent likelihood compares with its target, computed pair by pair."""
-    move = np.append(bridge - of.about, place) / of.size
+    """What such a likelihood compares with its target, computed pair by pair."""
+    move = np.linalg.solve(of.directions, np.append(bridge - of.about, place))
     bend = [
         sum(factor * move[i] * move[j] for factor, i, j in zip(shape, *PAIRS, strict=True))
         for shape in of.shapes
@@ -32,7 +48,8 @@ def rows(
 def drawn(seed: int) -> tuple[FloatArray, CurvatureTerms, FloatArray, FloatArray]:
     rng = np.random.default_rng(seed)
     root = rng.standard_normal((ROWS, BRIDGE + OTHERS + 1 + 2))
-    return root, bends(rng), ABOUT + 0.6 * SIZE[:3] * rng.standard_normal(3), rng.normal(size=2)
+    bridge = ABOUT + 0.6 * (DIRECTIONS @ rng.standard_normal(BRIDGE + 1))[:BRIDGE]
+    return root, terms(rng), bridge, rng.normal(size=2)
 
 
 def test_about_the_truth_it_goes_through_the_truth() -> None:
@@ -43,7 +60,7 @@ def test_about_the_truth_it_goes_through_the_truth() -> None:
         assert np.allclose(straight @ np.concatenate([bridge, others]), at, atol=1e-9)
 
 
-def test_beside_it_the_slope_is_that_of_the_bent_rows() -> None:
+def test_beside_it_the_slope_is_that_of_the_curved_rows() -> None:
     root, of, bridge, others = drawn(7)
     target = rows(root, of, bridge, others, 0.1)
     straight, at = linearise_with_curvature(root, target, of, bridge, 1e-9 * np.eye(OTHERS))
@@ -63,10 +80,82 @@ def test_beside_it_the_slope_is_that_of_the_bent_rows() -> None:
         assert np.allclose((moved - here) / 1e-6, slope, atol=1e-4)
 
 
-def test_far_away_it_is_no_further_than_it_is_believed() -> None:
-    root, of, bridge, others = drawn(2)
-    target = rows(root, of, bridge, others, 0.0)
-    priors = np.eye(OTHERS)
-    far = linearise_with_curvature(root, target, of, ABOUT + 50.0, priors)
-    at_most = linearise_with_curvature(root, target, of, ABOUT + 3.0 * SIZE[:3], priors)
-    assert np.array_equal(far[0], at_most[0])
+def test_far_away_it_is_no_further_than_the_terms_apply() -> None:
+    root, of, _, others = drawn(2)
+    size = np.array([0.5, 0.3, 0.2, 0.4])
+    of = of._replace(directions=np.diag(size))
+    target = rows(root, of, ABOUT, others, 0.0)
+    far, at_most = (
+        linearise_with_curvature(root, target, of, ABOUT + moved, np.eye(OTHERS))
+        for moved in (50.0, 3.0 * size[:BRIDGE])
+    )
+    assert np.allclose(far[0], at_most[0], atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def single_tyres() -> Optimum:
+    """A crossing on a road surface under equal tyres, at its truth."""
+    kind = KINDS["single-5"]._replace(elements=5)
+    site = site_of_truck(default_site(), kind, 0)
+    truth, seed = crossing_truth(site, kind, 0, 0, 0)
+    one = drive(site, truth, seed)
+    settings = IdentificationSettings(method="pre", threads=1)
+    (seen,) = crossing_data_only([one.run], one.site, settings)
+    problem, y = at_truth(seen, one)
+    state = levenberg_marquardt.initial_state(lambda at: posterior.all_rows(problem, at), y)
+    return Optimum(problem, state, Termination.CONVERGED, 1.0, 0, 1)
+
+
+def drawn_given(
+    covariance: FloatArray,
+    places: Indices,
+    given: Indices,
+    values: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Draw the coordinates `places` of a centred normal with the coordinates `given` known."""
+    inner = covariance[np.ix_(places, places)]
+    follow = np.linalg.solve(covariance[np.ix_(given, given)], covariance[np.ix_(given, places)])
+    inner = inner - follow.T @ covariance[np.ix_(given, places)]
+    return np.asarray(rng.multivariate_normal(follow.T @ values, inner))
+
+
+def test_terms_describe_the_residuals_where_the_posterior_is(single_tyres: Optimum) -> None:
+    """Bridge and offset as the posterior draws them: the terms are most of the curvature.
+
+    Terms of single coordinates, of which each moves by its own standard deviation, were ten times
+    as large as the curvature they were to describe.
+    """
+    problem, state = single_tyres.problem, single_tyres.state
+    where = posterior.layout(problem)
+    place = (where.trajectory.start + where.trajectory.stop) // 2
+    data = np.arange(problem.noise.reciprocal.size)
+    found, effect = curvature_terms(single_tyres, problem, data, place)
+    _, covariance = normal_approximation(single_tyres)
+    kept = np.append(where.bridge, place)
+    ends = np.intersect1d(where.bridge, where.half_normal)
+    others = np.setdiff1d(kept, ends)
+    draw = partial(drawn_given, covariance, rng=np.random.default_rng(5))
+    follow = covariance[:, kept] @ np.linalg.inv(covariance[np.ix_(kept, kept)])
+    sigma = posterior.rigidity_spread(problem.priors)
+    whole, left = [], []
+    for _ in range(20):
+        step = np.zeros(state.y.size)
+        step[ends] = np.abs(draw(ends, ends[:0], step[ends[:0]]))
+        step[others] = draw(others, ends, step[ends])
+        step = follow @ step[kept]
+        y = state.y + step
+        moved = posterior.data_rows(problem, y[None, :])[0]
+        # Terms and linear part are those of c, in which the elements are measured.
+        compliance = np.exp(-sigma * y[where.elements])
+        before = np.exp(-sigma * state.y[where.elements])
+        step[where.elements] = (compliance - before) / (-sigma * before)
+        straight = (state.residual + state.jacobian @ step)[data]
+        at = step[kept]
+        at[-1 - sigma.size : -1] = compliance - before
+        size = np.linalg.solve(found.directions, at)
+        first, second = np.triu_indices(size.size)
+        curved = effect @ (found.shapes @ (size[first] * size[second]))
+        whole.append(np.linalg.norm(moved - straight))
+        left.append(np.linalg.norm(moved - straight - curved))
+    assert np.median(left) < 0.5 * np.median(whole)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from schemas import fusion
 from schemas.reasons import BridgeReason, LeftOutReason, Reason
@@ -27,8 +28,8 @@ from services.identification.bridge_state import (
     usable,
     with_common_shares,
 )
-from services.identification.fusing import fused
-from services.identification.usable import source_of
+from services.identification.fusing import fused, part_of
+from services.identification.usable import Source, source_of
 
 NOMINAL = 1.6e10
 ELEMENTS = 5
@@ -64,6 +65,31 @@ def likelihood(
         knot_spacing_m=1.25,
         level_m3=(0.0, 0.0),
     )
+
+
+def test_moves_of_single_coordinates_are_directions_too() -> None:
+    """Older results have a size of each coordinate."""
+    plain = likelihood((1.0,) * ELEMENTS, 1)
+    moves = ELEMENTS + 2
+    size = tuple(np.linspace(0.1, 0.7, moves))
+    m = len(plain.target) + 2
+    terms = {"about": (0.0,) * (moves - 1), "shapes": (0.1,) * (moves * (moves + 1) // 2)}
+
+    def directions(**given: tuple[float, ...]) -> NDArray[np.float64]:
+        curved = plain.model_copy(
+            update={
+                "root": tuple(np.eye(m)[np.triu_indices(m)]),
+                "target": (0.0,) * m,
+                "bends": fusion.Bends(**terms, **given),
+            }
+        )
+        part, _ = part_of(Source("one", "lorry", 1, curved))
+        assert part.likelihood.bends is not None
+        return part.likelihood.bends.directions
+
+    of_all = np.diag(size) + 0.01
+    assert np.array_equal(directions(size=size), np.diag(size))
+    assert np.allclose(directions(directions=tuple(of_all.ravel())), of_all)
 
 
 def crossing(

@@ -158,8 +158,8 @@ def likelihoods(draw: st.DrawFn) -> FusionLikelihood:
         ),
         bends=Bends(
             about=some(len(bridge)),
-            size=tuple(draw(st.lists(sizes, min_size=moves, max_size=moves))),
             shapes=some(count * moves * (moves + 1) // 2),
+            **draw(st.sampled_from([{"size": (0.5,) * moves}, {"directions": some(moves**2)}])),
         )
         if knots
         else None,
