@@ -25,19 +25,21 @@ MAX_KEYS: Final = 500_000
 MAX_BRACKETS: Final = 150_000
 """Largest number of tables and lists together; `[[bridge]]` counts twice."""
 
-_PART = r'(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]++|\\.)*+"|\'[^\'\n]*+\')'
+# `(?!)`, which never matches, ends the alternatives of repeated groups: Python before 3.11.5 goes
+# on where the last alternative has failed rather than where it began.
+_PART = r'(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]++|\\.|(?!))*+"|\'[^\'\n]*+\')'
 _SCAN: Final = re.compile(
     r"#[^\n]*+"
-    r'|"""(?:[^"\\]++|\\[\s\S]|"(?!""))*+"""(?:"{0,2}+)'
-    r"|'''(?:[^']++|'(?!''))*+'''(?:'{0,2}+)"
-    rf"|(?P<deep>{_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{2,}}+)"
-    rf"|{_PART}(?:[ \t]*+\.[ \t]*+{_PART})?+"
+    r'|"""(?:[^"\\]++|\\[\s\S]|"(?!"")|(?!))*+"""(?:"{0,2}+)'
+    r"|'''(?:[^']++|'(?!'')|(?!))*+'''(?:'{0,2}+)"
+    rf"|(?P<deep>{_PART}(?:[ \t]*+\.[ \t]*+{_PART}|(?!)){{2,}}+)"
+    rf"|{_PART}(?:[ \t]*+\.[ \t]*+{_PART}|(?!))?+"
     r"|(?P<open>[\[{])|(?P<close>[\]}])|(?P<key>=)|(?P<end>[\"'])"
 )
 _DECIMAL_COMMA: Final = re.compile(
     r"[ \t]*[A-Za-z0-9_-]+[ \t]*=[ \t]*([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)[ \t]*(?:#.*)?"
 )
-_DOT: Final = re.compile(rf"{_PART}(?P<dot>[ \t]*+\.)?+")
+_DOT: Final = re.compile(rf"{_PART}(?P<dot>[ \t]*+\.)?")
 
 
 def read_toml_text(path: Path, what: str) -> str:
