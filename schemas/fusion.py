@@ -61,6 +61,16 @@ class Bends(StrictModel):
     are those of single coordinates."""
 
 
+class ShortWaves(StrictModel):
+    """Response of a crossing's estimate to waves of the mismatch, at 1, 2, … steps in cycles/m."""
+
+    step_cycles_per_m: Annotated[Finite, Field(gt=0)]
+    cosine: tuple[Finite, ...]
+    """Change of the bridge's x by cos(2 pi n x) m of mismatch, x the chainage: wave by wave for the
+    first parameter, then the next."""
+    sine: tuple[Finite, ...]
+
+
 class FusionLikelihood(StrictModel):
     """The likelihood of a crossing, as the module describes it."""
 
@@ -83,6 +93,7 @@ class FusionLikelihood(StrictModel):
     off_bridge_m: tuple[Stretch, ...] = ()
     """Mismatch before and after the bridge."""
     bends: Bends | None = None
+    short_waves: ShortWaves | None = None
 
     @model_validator(mode="after")
     def _has_its_size(self) -> "FusionLikelihood":
@@ -92,6 +103,13 @@ class FusionLikelihood(StrictModel):
         expected = len(self.bridge) + len(self.truck) + self._of_bends()
         if m < expected or (m > expected) != (self.first_knot_m is not None):
             raise ValueError("target must have a place for each coordinate, knot and bend")
+        short = self.short_waves
+        if short is not None and (
+            len(short.cosine) != len(short.sine) or len(short.sine) % len(self.bridge)
+        ):
+            raise ValueError(
+                "short_waves must have as many values for each parameter of the bridge"
+            )
         return self
 
     def _of_bends(self) -> int:

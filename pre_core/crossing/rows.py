@@ -74,6 +74,15 @@ def filter_rows(taps: FloatArray, every: int, x: FloatArray, out: FloatArray) ->
         out[k] = total
 
 
+def filter_adjoint(rows: RowFilter, y: FloatArray, samples: int) -> FloatArray:
+    """Return the adjoint of `filter_rows`: of values y (m,) to as many `samples` (n,)."""
+    apart = np.zeros(rows.every * (y.size - 1) + 1)
+    apart[:: rows.every] = y
+    out = np.zeros(samples)
+    out[: apart.size + rows.taps.size - 1] = np.convolve(apart, rows.taps)
+    return out
+
+
 def phases(rows: RowFilter, memory_s: float) -> NDArray[np.complex128]:
     """Return phases (f, lags) between residuals, for noise of correlation time `memory_s` in s."""
     if memory_s == 0.0:

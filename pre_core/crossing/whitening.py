@@ -175,6 +175,21 @@ def solve(factor: FloatArray, reciprocal: FloatArray, b: FloatArray) -> None:
 
 
 @summing
+def solve_transposed(factor: FloatArray, reciprocal: FloatArray, b: FloatArray) -> None:
+    """Back-substitute one right-hand side b (n,) of the transposed factor in place."""
+    n, width = factor.shape
+    band = width - 1
+    for i in range(n - 1, -1, -1):
+        value = b[i] * reciprocal[i]
+        b[i] = value
+        low = max(0, i - band)
+        x = factor[i, low - i + band : band]
+        y = b[low:i]
+        for k in range(x.size):
+            y[k] -= x[k] * value
+
+
+@summing
 def whiten_into(
     rows: RowFilter, noise: Whitener, residuals: FloatArray, row: FloatArray, out: FloatArray
 ) -> None:

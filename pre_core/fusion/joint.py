@@ -229,6 +229,10 @@ def _crossing_information(
     places = np.concatenate([np.arange(b), truck])
     key = path_group_key(part)
     if key in tracks:
+        if part.name in tracks[key].short_roots:
+            of_bridge = np.eye(linear.size)[:, :b]
+            root = tracks[key].short_roots[part.name]
+            precision, linear = add_covariance(precision, linear, of_bridge, root)
         q = of.knots_m.size
         along = np.zeros((linear.size, q))
         along[-q:] = np.eye(q)

@@ -40,6 +40,7 @@ from pre_core.crossing.splines import basis
 from pre_core.crossing.whitening import project_out_noise, solve
 from pre_core.fusion.curvature import CurvatureTerms, curvature_terms
 from pre_core.fusion.curvature import linearise_with_curvature as straightened_about
+from pre_core.fusion.short_waves import BESIDE_M, ShortWaveResponse, short_wave_response
 from pre_core.physics.simulate import rear_position_m
 from pre_core.search import levenberg_marquardt
 
@@ -55,8 +56,6 @@ paths leave short waves as large as long ones, so that waves of two metres are i
 _LONG_SHARE = 0.97
 """Share of the power of the longest waves; the rest stays noise of the crossing, because the
 covariance of the residuals must be positive definite."""
-_BESIDE_M = 7.5
-"""Distance before and after the bridge over which the mismatch is correlated with that on it."""
 _CUBIC = 3
 _ROUNDED = 1e-12
 OFF_BRIDGE_STEP_M = 0.25
@@ -98,6 +97,7 @@ class CrossingLikelihood(NamedTuple):
     off_bridge: OffBridgeMismatch | None
     bends: CurvatureTerms | None = None
     """Curvature terms; with them x continues with the longitudinal offset in m and the terms."""
+    short_waves: ShortWaveResponse | None = None
 
 
 def knot_spacing_m(mismatch: Mismatch) -> float:
@@ -178,11 +178,7 @@ def likelihood(found: Optimum, *, with_bends: bool = True) -> CrossingLikelihood
         _add_adjacent_prior(precision, found.problem.mismatch, grid, inner, y.size)
     precision, linear = marginal(precision, linear, kept)
     if differs:
-        led = np.zeros(linear.size)
-        led[bridge.size : bridge.size + truck.size] = mismatch_bias(found)[truck]
-        precision, linear = add_covariance(
-            precision, linear, led[:, None], np.array([[MISMATCH_BIAS_SPREAD]])
-        )
+        precision, linear = _with_mismatch_bias(found, precision, linear, truck)
     return CrossingLikelihood(
         *_as_root(precision, linear),
         _coordinates(problem, bridge),
@@ -191,7 +187,18 @@ def likelihood(found: Optimum, *, with_bends: bool = True) -> CrossingLikelihood
         found.problem.mismatch.level_m3 * long_wave_power(found.problem.mismatch),
         _off_bridge(found) if differs else None,
         bends,
+        _short_waves_of(found) if differs and with_bends else None,
     )
+
+
+def _with_mismatch_bias(
+    found: Optimum, precision: FloatArray, linear: FloatArray, truck: NDArray[np.int64]
+) -> tuple[FloatArray, FloatArray]:
+    """Return precision (n, n) and linear part (n,) with the bias's error of the `truck` (t,)."""
+    b = posterior.layout(found.problem).bridge.size
+    led = np.zeros(linear.size)
+    led[b : b + truck.size] = mismatch_bias(found)[truck]
+    return add_covariance(precision, linear, led[:, None], np.array([[MISMATCH_BIAS_SPREAD]]))
 
 
 def linearised_likelihood(
@@ -237,7 +244,13 @@ def in_coordinates(
             about=(bends.about - aside) / factor,
             directions=bends.directions / np.append(factor, 1.0)[:, None],
         )
-    return crossing._replace(root=root, target=target, bridge=coordinates, bends=bends)
+    short = crossing.short_waves
+    if short is not None:
+        by = 1.0 / factor[:, None]
+        short = short._replace(cosine=by * short.cosine, sine=by * short.sine)
+    return crossing._replace(
+        root=root, target=target, bridge=coordinates, bends=bends, short_waves=short
+    )
 
 
 def add_covariance(
@@ -258,6 +271,11 @@ def add_covariance(
     )
 
 
+def _short_waves_of(found: Optimum) -> ShortWaveResponse:
+    at = posterior.points(found.problem, found.state.y[None, :])
+    return short_wave_response(found, _rear_m(found.problem.crossing, at))
+
+
 def _short_waves(mismatch: Mismatch) -> Mismatch:
     shapes = mismatch.shapes
     share = long_share(shapes.cycles_per_m, knot_spacing_m(mismatch))
@@ -276,7 +294,7 @@ def _knots(
     first = int(np.floor(rear.min() / knot_m)) - 2
     last = int(np.ceil(rear.max() / knot_m)) + 2
     grid = knot_m * np.arange(first, last + 1)
-    near = (grid > -_BESIDE_M) & (grid < problem.crossing.span_m + _BESIDE_M)
+    near = (grid > -BESIDE_M) & (grid < problem.crossing.span_m + BESIDE_M)
     return np.asarray(grid), np.asarray(np.flatnonzero(near), dtype=np.int64)
 
 

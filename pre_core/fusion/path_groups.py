@@ -18,7 +18,12 @@ from pre_core.fusion.lateral_wander import (
     shared_fraction,
     wander_posterior,
 )
-from pre_core.fusion.likelihood import CrossingLikelihood, covariance_of_coefficients
+from pre_core.fusion.likelihood import (
+    CrossingLikelihood,
+    covariance_of_coefficients,
+    long_share,
+)
+from pre_core.fusion.short_waves import shared_error_roots
 from pre_core.physics.road import Profile
 from pre_core.physics.surface import Footprint
 
@@ -74,6 +79,8 @@ class PathGroup(NamedTuple):
     common: FloatArray | None
     """Covariance (q, q) of the shared part in mm²; None for a single run, whose waves are its own.
     """
+    short_roots: dict[str, FloatArray]
+    """Root (b, r) by run of its errors' covariance with those of the others by short waves."""
 
 
 def path_groups(parts: Sequence[FusionInput]) -> dict[PathGroupKey, PathGroup]:
@@ -94,7 +101,7 @@ def _track(key: PathGroupKey, runs: list[FusionInput]) -> PathGroup:
     if len(runs) == 1:
         shared = SharedMismatch(key.truck, key.direction, 0.0, None, level)
         return PathGroup(
-            shared, low_rank_root(everything), np.asarray(np.linalg.inv(everything)), None
+            shared, low_rank_root(everything), np.asarray(np.linalg.inv(everything)), None, {}
         )
     mismatch = Mismatch(shapes, level, 1.0)
     off_bridge = [run.likelihood.off_bridge for run in runs]
@@ -111,7 +118,23 @@ def _track(key: PathGroupKey, runs: list[FusionInput]) -> PathGroup:
         level,
     )
     own = low_rank_root(everything - common)
-    return PathGroup(shared, own, np.asarray(np.linalg.inv(everything)), common)
+    whole_inverse = np.asarray(np.linalg.inv(everything))
+    short = density * (1.0 - long_share(shapes.cycles_per_m, float(knots[1] - knots[0])))
+    roots = _short_roots(runs, shapes.cycles_per_m, short)
+    return PathGroup(shared, own, whole_inverse, common, roots)
+
+
+def _short_roots(
+    runs: list[FusionInput], cycles_per_m: FloatArray, density: FloatArray
+) -> dict[str, FloatArray]:
+    """Return the roots of what short waves of a spectrum (g,) do to runs that have a response."""
+    have = {run.name: run.likelihood.short_waves for run in runs}
+    responses = {name: one for name, one in have.items() if one is not None}
+    if len(responses) < 2:
+        return {}
+    first = next(iter(responses.values()))
+    at_waves = np.interp(first.cycles_per_m, cycles_per_m, density)
+    return dict(zip(responses, shared_error_roots([*responses.values()], at_waves), strict=True))
 
 
 def path_group_key(part: FusionInput) -> PathGroupKey:

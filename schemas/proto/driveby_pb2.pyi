@@ -319,8 +319,18 @@ class Bends(_message.Message):
     directions: _containers.RepeatedScalarFieldContainer[float]
     def __init__(self, about: _Optional[_Iterable[float]] = ..., size: _Optional[_Iterable[float]] = ..., shapes: _Optional[_Iterable[float]] = ..., directions: _Optional[_Iterable[float]] = ...) -> None: ...
 
+class ShortWaves(_message.Message):
+    __slots__ = ("step_cycles_per_m", "cosine", "sine")
+    STEP_CYCLES_PER_M_FIELD_NUMBER: _ClassVar[int]
+    COSINE_FIELD_NUMBER: _ClassVar[int]
+    SINE_FIELD_NUMBER: _ClassVar[int]
+    step_cycles_per_m: float
+    cosine: _containers.RepeatedScalarFieldContainer[float]
+    sine: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, step_cycles_per_m: _Optional[float] = ..., cosine: _Optional[_Iterable[float]] = ..., sine: _Optional[_Iterable[float]] = ...) -> None: ...
+
 class FusionLikelihood(_message.Message):
-    __slots__ = ("bridge", "truck", "root", "target", "element_lengths_m", "mass_spread", "footprints", "first_knot_m", "knot_spacing_m", "level_m3", "off_bridge_m", "bends")
+    __slots__ = ("bridge", "truck", "root", "target", "element_lengths_m", "mass_spread", "footprints", "first_knot_m", "knot_spacing_m", "level_m3", "off_bridge_m", "bends", "short_waves")
     BRIDGE_FIELD_NUMBER: _ClassVar[int]
     TRUCK_FIELD_NUMBER: _ClassVar[int]
     ROOT_FIELD_NUMBER: _ClassVar[int]
@@ -333,6 +343,7 @@ class FusionLikelihood(_message.Message):
     LEVEL_M3_FIELD_NUMBER: _ClassVar[int]
     OFF_BRIDGE_M_FIELD_NUMBER: _ClassVar[int]
     BENDS_FIELD_NUMBER: _ClassVar[int]
+    SHORT_WAVES_FIELD_NUMBER: _ClassVar[int]
     bridge: _containers.RepeatedCompositeFieldContainer[Coordinate]
     truck: _containers.RepeatedCompositeFieldContainer[Coordinate]
     root: _containers.RepeatedScalarFieldContainer[float]
@@ -345,7 +356,8 @@ class FusionLikelihood(_message.Message):
     level_m3: _containers.RepeatedScalarFieldContainer[float]
     off_bridge_m: _containers.RepeatedCompositeFieldContainer[Stretch]
     bends: Bends
-    def __init__(self, bridge: _Optional[_Iterable[_Union[Coordinate, _Mapping]]] = ..., truck: _Optional[_Iterable[_Union[Coordinate, _Mapping]]] = ..., root: _Optional[_Iterable[float]] = ..., target: _Optional[_Iterable[float]] = ..., element_lengths_m: _Optional[_Iterable[float]] = ..., mass_spread: _Optional[float] = ..., footprints: _Optional[_Iterable[_Union[Footprint, _Mapping]]] = ..., first_knot_m: _Optional[float] = ..., knot_spacing_m: _Optional[float] = ..., level_m3: _Optional[_Iterable[float]] = ..., off_bridge_m: _Optional[_Iterable[_Union[Stretch, _Mapping]]] = ..., bends: _Optional[_Union[Bends, _Mapping]] = ...) -> None: ...
+    short_waves: ShortWaves
+    def __init__(self, bridge: _Optional[_Iterable[_Union[Coordinate, _Mapping]]] = ..., truck: _Optional[_Iterable[_Union[Coordinate, _Mapping]]] = ..., root: _Optional[_Iterable[float]] = ..., target: _Optional[_Iterable[float]] = ..., element_lengths_m: _Optional[_Iterable[float]] = ..., mass_spread: _Optional[float] = ..., footprints: _Optional[_Iterable[_Union[Footprint, _Mapping]]] = ..., first_knot_m: _Optional[float] = ..., knot_spacing_m: _Optional[float] = ..., level_m3: _Optional[_Iterable[float]] = ..., off_bridge_m: _Optional[_Iterable[_Union[Stretch, _Mapping]]] = ..., bends: _Optional[_Union[Bends, _Mapping]] = ..., short_waves: _Optional[_Union[ShortWaves, _Mapping]] = ...) -> None: ...
 
 class Estimate(_message.Message):
     __slots__ = ("schema_version", "program", "version", "created_ns", "site_hash", "settings_json", "seed", "crossing_id", "realm", "vehicle", "bridge", "direction", "entry_time_ns", "exit_time_ns", "speed_m_per_s", "method", "certificate", "verdict", "reasons", "reason_texts", "chi2_per_dof", "diagnostics", "parameters", "scale_error", "covariance", "derived", "road", "fusion_likelihood")

@@ -15,6 +15,7 @@ from pre_core.fusion.curvature import CurvatureTerms
 from pre_core.fusion.information import BridgePriors
 from pre_core.fusion.joint import FusedDraws, build_joint, sample_joint
 from pre_core.fusion.path_groups import FusionInput
+from pre_core.fusion.short_waves import ShortWaveResponse
 from pre_core.fusion.vehicle_consistency import find_misattributed
 from pre_core.physics.road import Profile
 from pre_core.physics.surface import Footprint
@@ -28,7 +29,8 @@ Floats = NDArray[np.float64]
 
 _DIGITS = 9
 """Significant digits of a likelihood: rounding moves an estimate by 1e-6 of its uncertainty."""
-_DIGITS_OF_BENDS = 4
+_FEW_DIGITS = 4
+"""Significant digits of the curvature terms and of responses to short waves."""
 _DRAWS_PER_CHAIN = 250
 _SEED = 1
 _COMPARED, _JOINED = 0.1, 0.4
@@ -74,19 +76,30 @@ def stored(data: CrossingData, found: Optimum) -> fusion.FusionLikelihood:
         level_m3=_rounded(likelihood.level_m3),
         off_bridge_m=_stretches(likelihood.off_bridge),
         bends=_stored_bends(likelihood.bends),
+        short_waves=_stored_short_waves(likelihood.short_waves),
     )
 
 
 def _stored_bends(of: CurvatureTerms | None) -> fusion.Bends | None:
     if of is None:
         return None
-    shapes = tuple(float(f"{value:.{_DIGITS_OF_BENDS}e}") for value in of.shapes.ravel())
+    shapes = _rounded(of.shapes.ravel(), _FEW_DIGITS)
     directions = _rounded(of.directions.ravel())
     return fusion.Bends(about=_rounded(of.about), directions=directions, shapes=shapes)
 
 
-def _rounded(values: Floats) -> tuple[float, ...]:
-    return tuple(float(f"{value:.{_DIGITS}e}") for value in values)
+def _stored_short_waves(of: ShortWaveResponse | None) -> fusion.ShortWaves | None:
+    if of is None:
+        return None
+    return fusion.ShortWaves(
+        step_cycles_per_m=of.step_cycles_per_m,
+        cosine=_rounded(of.cosine.ravel(), _FEW_DIGITS),
+        sine=_rounded(of.sine.ravel(), _FEW_DIGITS),
+    )
+
+
+def _rounded(values: Floats, digits: int = _DIGITS) -> tuple[float, ...]:
+    return tuple(float(f"{value:.{digits}e}") for value in values)
 
 
 def _coordinates(
@@ -236,6 +249,7 @@ def _part(source: Source, coordinates: of_crossing.Coordinates) -> FusionInput:
         np.array(of.level_m3),
         _off_bridge(of),
         _bends(of),
+        _short_waves(of),
     )
     likelihood = of_crossing.in_coordinates(likelihood, coordinates, len(of.element_lengths_m))
     # A truck whose site file has changed may be another one.
@@ -273,6 +287,16 @@ def _bends(of: fusion.FusionLikelihood) -> CurvatureTerms | None:
     if of.bends.size:
         directions = np.diag(of.bends.size)
     return CurvatureTerms(np.array(of.bends.about), directions, shapes)
+
+
+def _short_waves(of: fusion.FusionLikelihood) -> ShortWaveResponse | None:
+    if of.short_waves is None:
+        return None
+    cosine, sine = (
+        np.array(values).reshape(len(of.bridge), -1)
+        for values in (of.short_waves.cosine, of.short_waves.sine)
+    )
+    return ShortWaveResponse(of.short_waves.step_cycles_per_m, cosine, sine)
 
 
 def _off_bridge(of: fusion.FusionLikelihood) -> of_crossing.OffBridgeMismatch | None:

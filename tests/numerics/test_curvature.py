@@ -3,20 +3,12 @@
 from functools import partial
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from pre_core.crossing import posterior
-from pre_core.crossing.fit import Optimum, normal_approximation
+from pre_core.crossing.fit import normal_approximation
 from pre_core.fusion.curvature import CurvatureTerms, curvature_terms, linearise_with_curvature
-from pre_core.search import levenberg_marquardt
-from pre_core.search.loop import Termination
-from schemas.settings import IdentificationSettings
-from services.simulation.data_alone import crossing_data_only
-from services.simulation.drawn import default_site, drive
-from services.simulation.survey_kinds import KINDS
-from studies.validation.bound import at_truth
-from studies.validation.surveys import crossing_truth, site_of_truck
+from tests.numerics.single_tyres import at_its_truth
 
 FloatArray = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -92,20 +84,6 @@ def test_far_away_it_is_no_further_than_the_terms_apply() -> None:
     assert np.allclose(far[0], at_most[0], atol=1e-12)
 
 
-@pytest.fixture(scope="module")
-def single_tyres() -> Optimum:
-    """A crossing on a road surface under equal tyres, at its truth."""
-    kind = KINDS["single-5"]._replace(elements=5)
-    site = site_of_truck(default_site(), kind, 0)
-    truth, seed = crossing_truth(site, kind, 0, 0, 0)
-    one = drive(site, truth, seed)
-    settings = IdentificationSettings(method="pre", threads=1)
-    (seen,) = crossing_data_only([one.run], one.site, settings)
-    problem, y = at_truth(seen, one)
-    state = levenberg_marquardt.initial_state(lambda at: posterior.all_rows(problem, at), y)
-    return Optimum(problem, state, Termination.CONVERGED, 1.0, 0, 1)
-
-
 def drawn_given(
     covariance: FloatArray,
     places: Indices,
@@ -120,18 +98,19 @@ def drawn_given(
     return np.asarray(rng.multivariate_normal(follow.T @ values, inner))
 
 
-def test_terms_describe_the_residuals_where_the_posterior_is(single_tyres: Optimum) -> None:
+def test_terms_describe_the_residuals_where_the_posterior_is() -> None:
     """Bridge and offset as the posterior draws them: the terms are most of the curvature.
 
-    Terms of single coordinates, of which each moves by its own standard deviation, were ten times
-    as large as the curvature they were to describe.
+    Terms of single coordinates, of which each moves by its own standard deviation, would leave
+    more than there is without any.
     """
-    problem, state = single_tyres.problem, single_tyres.state
+    optimum = at_its_truth()
+    problem, state = optimum.problem, optimum.state
     where = posterior.layout(problem)
     place = (where.trajectory.start + where.trajectory.stop) // 2
     data = np.arange(problem.noise.reciprocal.size)
-    found, effect = curvature_terms(single_tyres, problem, data, place)
-    _, covariance = normal_approximation(single_tyres)
+    found, effect = curvature_terms(optimum, problem, data, place)
+    _, covariance = normal_approximation(optimum)
     kept = np.append(where.bridge, place)
     ends = np.intersect1d(where.bridge, where.half_normal)
     others = np.setdiff1d(kept, ends)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from schemas.errors import InputError
-from schemas.fusion import AxleFootprint, Bends, Coordinate, FusionLikelihood, Stretch
+from schemas.fusion import AxleFootprint, Bends, Coordinate, FusionLikelihood, ShortWaves, Stretch
 from schemas.proto import driveby_pb2 as pb
 from schemas.reasons import REASON_TEXTS, Reason, texts
 from schemas.results import (
@@ -160,6 +160,11 @@ def likelihoods(draw: st.DrawFn) -> FusionLikelihood:
             about=some(len(bridge)),
             shapes=some(count * moves * (moves + 1) // 2),
             **draw(st.sampled_from([{"size": (0.5,) * moves}, {"directions": some(moves**2)}])),
+        )
+        if knots
+        else None,
+        short_waves=ShortWaves(
+            step_cycles_per_m=0.02, cosine=some(2 * len(bridge)), sine=some(2 * len(bridge))
         )
         if knots
         else None,

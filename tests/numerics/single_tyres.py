@@ -1,0 +1,28 @@
+"""A crossing on a road surface under equal tyres, at its truth."""
+
+from functools import cache
+
+from pre_core.crossing import posterior
+from pre_core.crossing.fit import Optimum
+from pre_core.search import levenberg_marquardt
+from pre_core.search.loop import Termination
+from schemas.settings import IdentificationSettings
+from services.simulation.data_alone import crossing_data_only
+from services.simulation.drawn import default_site, drive
+from services.simulation.survey_kinds import KINDS
+from studies.validation.bound import at_truth
+from studies.validation.surveys import crossing_truth, site_of_truck
+
+
+@cache
+def at_its_truth() -> Optimum:
+    """Return the truth of a crossing of five elements as if a search had ended there."""
+    kind = KINDS["single-5"]._replace(elements=5)
+    site = site_of_truck(default_site(), kind, 0)
+    truth, seed = crossing_truth(site, kind, 0, 0, 0)
+    one = drive(site, truth, seed)
+    settings = IdentificationSettings(method="pre", threads=1)
+    (seen,) = crossing_data_only([one.run], one.site, settings)
+    problem, y = at_truth(seen, one)
+    state = levenberg_marquardt.initial_state(lambda at: posterior.all_rows(problem, at), y)
+    return Optimum(problem, state, Termination.CONVERGED, 1.0, 0, 1)
