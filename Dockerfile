@@ -79,6 +79,7 @@ COPY --from=service-environment /opt/driveby /opt/driveby
 # What numba wrote as root is removed: the service writes there itself.
 RUN python -c "import driveby.services.logger.run, driveby.services.cli.metrics" \
     && python -c "import driveby.services.worker.run, driveby.services.simulation.drive" \
+    && python -c "import distributed, duckdb, pyarrow.parquet, rosbags, s3fs" \
     && driveby health --help >/dev/null \
     && rm -rf /tmp/kernels
 # The root file system is read-only and numba wants to write beside what it reads, so entrypoint.sh

@@ -9,7 +9,7 @@ set -e
 cd "$1"/lib/python3*/site-packages
 rm -rf rerun_cli numba/cuda/tests ./*.dist-info/sboms \
     pyarrow/include pyarrow/src pyarrow/*flight* pyarrow/*s3* pyarrow/*_cpp_tests* \
-    pyarrow/*substrait* PIL/_avif* pillow.libs/libavif*
+    pyarrow/_substrait* PIL/_avif* pillow.libs/libavif*
 for service in botocore/data/*/; do
     case $service in */s3/ | */sts/ | */sso/ | */sso-oidc/ | */signin/) ;; *) rm -rf "$service" ;; esac
 done
