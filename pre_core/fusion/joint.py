@@ -25,7 +25,7 @@ from pre_core.fusion.information import (
     JointInformation,
     JointLayout,
 )
-from pre_core.fusion.likelihood import CrossingLikelihood, add_covariance, linearised_likelihood
+from pre_core.fusion.likelihood import CrossingLikelihood, integrate_errors, linearised_likelihood
 from pre_core.fusion.path_groups import (
     FusionInput,
     PathGroup,
@@ -93,11 +93,15 @@ def sample_joint(
 
 
 def build_joint(
-    parts: Sequence[FusionInput], priors: BridgePriors, consistent: Collection[str] | None = None
+    parts: Sequence[FusionInput],
+    priors: BridgePriors,
+    consistent: Collection[str] | None = None,
+    start: FloatArray | None = None,
 ) -> JointInformation:
     """Return crossings with all own variables but the bridge's change integrated out.
 
-    Changes are relative to the estimate from all crossings, or from those named in `consistent`.
+    Changes are relative to the estimate from all crossings, or from those named in `consistent`,
+    next to the bridge `start` (b,); None: the nominal one, first about each crossing's own.
     """
     parts = sorted(parts, key=lambda part: part.name)
     tracks = path_groups(parts)
@@ -105,9 +109,9 @@ def build_joint(
     prior = _prior(layout, tracks)
     shared = tuple(track.shared for track in tracks.values())
     names = tuple(part.name for part in parts)
-    centre = _nominal(layout)
+    centre = _nominal(layout) if start is None else start
     for number in range(_PASSES):
-        bridge = centre if number else None
+        bridge = None if number == 0 and start is None else centre
         crossings = tuple(
             _crossing_information(
                 _linearised_about(part, tracks, bridge), layout, tracks, priors, centre
@@ -226,22 +230,24 @@ def _crossing_information(
     of, b = part.likelihood, layout.bridge
     truck = layout.trucks[part.truck]
     precision, linear = add_mass_parameter(of, part.mass_spread, priors, centre)
+    constant = -0.5 * float(of.target @ of.target)
     places = np.concatenate([np.arange(b), truck])
     key = path_group_key(part)
     if key in tracks:
+        unit = np.eye(linear.size)
         if part.name in tracks[key].short_roots:
-            of_bridge = np.eye(linear.size)[:, :b]
-            root = tracks[key].short_roots[part.name]
-            precision, linear = add_covariance(precision, linear, of_bridge, root)
+            moved = unit[:, :b] @ tracks[key].short_roots[part.name]
+            precision, linear, more = integrate_errors(precision, linear, moved)
+            constant += more
         q = of.knots_m.size
-        along = np.zeros((linear.size, q))
-        along[-q:] = np.eye(q)
-        precision, linear = add_covariance(precision, linear, along, tracks[key].own_root)
+        moved = unit[:, -q:] @ tracks[key].own_root
+        precision, linear, more = integrate_errors(precision, linear, moved)
+        constant += more
         if key in layout.tracks:
             places = np.concatenate([places, layout.tracks[key]])
         else:  # no other variable affects these waves
             precision, linear = precision[:-q, :-q], linear[:-q]
-    return CrossingInformation(precision, linear, places)
+    return CrossingInformation(precision, linear, places, constant)
 
 
 def add_mass_parameter(
