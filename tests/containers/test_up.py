@@ -183,6 +183,22 @@ def test_metrics_are_answered_on_loopback(up: Stack) -> None:
     assert up.docker("port", up.name("router")).out == "7447/tcp -> 127.0.0.1:7447"
 
 
+def test_view_draws_and_reports(up: Stack, taken: Path, tmp_path: Path) -> None:
+    up.compose("build", "view")
+    size = int(up.docker("image", "inspect", "-f", "{{.Size}}", "driveby-view").out) / 1e6
+    print(f"\ndriveby-view: {size:.0f} MB")
+    up.compose("run", "--rm", "view")
+    [results] = taken.rglob("results-*.json")
+    of_results = f"recordings/{results.relative_to(taken)}"
+    up.compose("run", "--rm", "view", "report", of_results, "--output", "recordings/report.html")
+    made = up.take("recordings", tmp_path / "made")
+    assert (made / "compose.rrd").read_bytes().startswith(b"RRF2")
+    pictures = list((made / "figures").rglob("*.png"))
+    assert pictures
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in pictures)
+    assert "</html>" in (made / "report.html").read_text()
+
+
 def test_down_leaves_only_the_volumes(up: Stack) -> None:
     up.make("down")
     left = up.left()
