@@ -34,7 +34,8 @@ demo: $(STAMP) ## a truck crosses a bridge: simulated, recorded, identified, dra
 up: ## the demo's services as containers (Docker Engine 26.0, Compose 2.26)
 	@$(PYTHON) docs/scripts/container_versions.py
 	docker compose build
-	docker volume inspect $${COMPOSE_PROJECT_NAME:-driveby}_certs >/dev/null 2>&1 || docker compose run --rm certs
+	if docker volume inspect $${COMPOSE_PROJECT_NAME:-driveby}_certs >/dev/null 2>&1; \
+	then docker compose run --rm certs certs certs; else docker compose run --rm certs; fi
 	docker compose up --detach --wait worker
 	docker compose up --detach truck
 
@@ -53,7 +54,7 @@ test-all: $(STAMP) ## the default tests and the slow ones
 faults: $(STAMP) ## everything that tries to lose or break data, but the soak (20 to 30 minutes)
 	$(BIN)/python -m pytest tests/faults -m "not soak" --session-timeout=2400
 
-containers: $(STAMP) ## make up, faults, limits and confinement in an engine of containers (12 minutes)
+containers: $(STAMP) ## make up, faults, limits, upgrade, cluster, wheels in an engine of containers (an hour)
 	$(BIN)/python -m pytest tests/containers -m containers
 
 KILLS ?= 50

@@ -150,6 +150,8 @@ def test_logs_are_bounded_and_json_when_asked(up: Stack, taken: Path) -> None:
     up.environment["DRIVEBY_LOG_FORMAT"] = "json"
     try:
         up.compose("up", "--detach", "--wait", "logger", "worker")
+        began = {name: up.state(name)["StartedAt"] for name in ("logger", "router")}
+        assert began["logger"] < began["router"]  # it reads what rules came with the new logger
         lines = [json.loads(line) for line in up.log("worker").splitlines() if line]
         assert {line["realm"] for line in lines} == {"sim-compose"}
         assert [line for line in lines if line["message"].startswith("ready")]

@@ -74,7 +74,6 @@ NOT_RUN = {
     "driveby identify recordings --site site.toml --scheduler tls://127.0.0.1:8786 "
     "--tls cluster-certs/client --into identified": CLUSTER,
     "pytest tests/faults/test_cluster.py": ITSELF,
-    'pip install "driveby[identify,cluster]"': NETWORK,
     'pip install -e ".[opensees]"': NETWORK,
     "python -m tests.benchmarks.cluster_scale --crossings 2000": LONG,
     "make install": "installs what this test runs in; .ci/run begins with it",

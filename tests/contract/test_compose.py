@@ -67,7 +67,9 @@ def test_everything_waits_for_health_and_not_for_a_start(name: str) -> None:
     assert isinstance(waits, dict)
     for other, how in waits.items():
         if other in LASTING:
-            assert how == {"condition": "service_healthy"}
+            reads_rules = (name, other) == ("router", "logger")
+            restart = {"restart": True} if reads_rules else {}
+            assert how == {"condition": "service_healthy", **restart}
             assert "healthcheck" in SERVICES[other]
         else:
             assert how == {"condition": "service_completed_successfully"}
