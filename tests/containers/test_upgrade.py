@@ -110,6 +110,7 @@ def today(engine: None, tmp_path: Path) -> Iterator[Stack]:
         yield stack
         stack.docker("rm", "--force", f"{PROJECT}-far")
     stack.docker("volume", "rm", "--force", f"{PROJECT}_far")
+    stack.docker("network", "rm", "--force", f"{PROJECT}_default")  # of the early compose.yaml
 
 
 def change_owner(stack: Stack, image: str) -> None:
