@@ -4,6 +4,9 @@
 # files. Images that are there already stay.
 #
 #     sh tests/containers/images.sh [FOLDER]
+#     BASES="python:3.13-slim-trixie python:3.14-slim-forky" sh tests/containers/images.sh
+#
+# BASES names further base images, of other Debian releases: test_wheels.py takes them.
 #
 # `zenohd` is the program that ZENOHD names, or that of PATH, or is compiled from crates.io into
 # FOLDER (default: build/containers). Without cargo stand_in.py takes its place, or with
@@ -14,7 +17,6 @@ cd "$(dirname "$0")/../.."
 folder=$(mkdir -p "${1:-build/containers}" && cd "${1:-build/containers}" && pwd)
 base=$(sed -n 's/^ARG BASE=//p' Dockerfile)
 router=$(sed -n 's/^ *image: \(eclipse\/zenoh:.*\)/\1/p' compose.yaml)
-suite=${base##*-}
 sources=$(cat /etc/apt/sources.list /etc/apt/sources.list.d/*.sources 2>/dev/null || true)
 mirror=${DEBIAN:-$(echo "$sources" | sed -nE 's/^(URIs:|deb) *([^ ]+).*/\2/p' | head -n 1)}
 
@@ -23,18 +25,23 @@ there() { docker image inspect "$1" >/dev/null 2>&1; }
 # What the official image leaves out, this one does, too: documentation, translations, lists of
 # packages, compiled Python. `python` is Debian's own interpreter.
 make_base() {
+    suite=${1##*-}
+    # debootstrap treats all releases since 2020 alike and does not know the names of the newest.
+    script=/usr/share/debootstrap/scripts/$suite
+    [ -e "$script" ] || script=/usr/share/debootstrap/scripts/sid
     root=$(mktemp -d "$folder/root.XXXXXX")
     trap 'rm -rf "$root"' EXIT
     debootstrap --variant=minbase --include=python3,python3-pip,ca-certificates \
-        "$suite" "$root" "$mirror" >"$folder/debootstrap.log"
-    chroot "$root" python3 -c 'import sys; assert sys.argv[1].startswith(f"{sys.version_info[0]}.{sys.version_info[1]}-")' "${base#*:}"
+        "$suite" "$root" "$mirror" "$script" >"$folder/debootstrap.log"
+    chroot "$root" python3 -c 'import sys; assert sys.argv[1].startswith(f"{sys.version_info[0]}.{sys.version_info[1]}-")' "${1#*:}"
     find "$root/usr" -name __pycache__ -type d -prune -exec rm -rf {} +
     rm -rf "$root"/var/lib/apt/lists/* "$root"/var/cache/* "$root"/usr/share/doc \
         "$root"/usr/share/man "$root"/usr/share/info "$root"/usr/share/locale \
         "$root"/usr/lib/python3*/EXTERNALLY-MANAGED
     mkdir -p "$root/var/cache/apt/archives/partial" "$root/var/lib/apt/lists/partial"
     ln -s /usr/bin/python3 "$root/usr/local/bin/python"
-    tar -C "$root" -c . | docker import -c 'CMD ["python3"]' - "$base" >/dev/null
+    tar -C "$root" -c . | docker import -c 'CMD ["python3"]' - "$1" >/dev/null
+    rm -rf "$root"
 }
 
 # As the official image: /zenohd behind /entrypoint.sh.
@@ -69,7 +76,7 @@ END
     rm -r "$context"
 }
 
-there "$base" || make_base
+for one in "$base" ${BASES:-}; do there "$one" || make_base "$one"; done
 there "$router" || make_router
-docker image ls --format '{{.Repository}}:{{.Tag}} {{.Size}}' | grep -F -e "$base" -e "$router"
+docker image ls --format '{{.Repository}}:{{.Tag}} {{.Size}}' | grep -F -e "$router" $(printf -- "-e %s " "$base" ${BASES:-})
 docker run --rm --entrypoint /zenohd "$router" --version
