@@ -19,7 +19,7 @@ $(PACKAGES): requirements/dev.txt pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed; set PYTHON=…")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV), a few minutes the first time"
-	$(BIN)/python -m pip install --quiet --require-hashes -r requirements/dev.txt
+	$(BIN)/python -m pip install --quiet --no-compile --require-hashes -r requirements/dev.txt
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --no-index -e .
 	@touch $@
 
@@ -79,7 +79,7 @@ validate: $(STAMP) ## is the uncertainty true: tables, figure, docs/validation.m
 	mkdir -p build
 	$(BIN)/driveby validate --method pre --out-of-model $(WORLDS) --records build/worlds.jsonl --json build/validation.json --figures docs/images --page docs/validation.md
 
-lint: $(STAMP) ## format, lint, types and import contracts
+lint: $(PACKAGES) ## format, lint, types and import contracts
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy

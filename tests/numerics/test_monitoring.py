@@ -453,6 +453,7 @@ def test_two_periods_are_compared_without_what_they_share() -> None:
     assert np.mean(widths) == pytest.approx(0.03 * np.sqrt(2.0), rel=0.05)
 
 
+@pytest.mark.slow
 def test_plain_series_against_skchange() -> None:
     """One element, independent errors, one temperature: where its segments meet, a change began."""
     from skchange.detectors import PELT
