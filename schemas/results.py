@@ -355,8 +355,8 @@ class LowestElement(NamedTuple):
     high: float | None
 
     def __str__(self) -> str:
-        """Return the text, such as EI_4 0.404 of nominal (0.394 to 0.415)."""
-        interval = "" if self.low is None else f" ({self.low:.3f} to {self.high:.3f})"
+        """Return the text, such as EI_4 0.404 of nominal (95 %: 0.394 to 0.415)."""
+        interval = "" if self.low is None else f" (95 %: {self.low:.3f} to {self.high:.3f})"
         return f"{self.name} {self.ratio:.3f} of nominal{interval}"
 
 

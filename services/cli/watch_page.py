@@ -167,7 +167,7 @@ def _late_sample_notes(trucks: Sequence[tuple[str, TruckRow]], realm: str) -> li
 
 
 def _crossings(rows: Sequence[CrossingRow], *, is_wide: bool) -> Table:
-    names = ("entry", "crossing", "", "EI", "lowest, of nominal")
+    names = ("entry", "crossing", "", "EI", "lowest, of nominal (95 %)")
     table = _table(*names, *(["why"] if is_wide else []))
     for row in rows:
         state = Text(row.state, style=_VERDICTS.get(row.state, ""))

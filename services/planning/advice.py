@@ -103,12 +103,12 @@ def _of_the_others(found: SurveyForecast) -> str:
     else:
         verb = "detects" if best.needed_middle == 1 else "detect"
         gain = f"then {_crossings(best.needed_middle)} {verb} it, and {_ends(best)}"
-    sentence = f"What helps most: {best.plan.name}; {gain}."
+    sentence = f"What helps most: {best.plan.label}; {gain}."
     if len(better) > 1:
         next_best = better[1]
         smallest = next_best.expected.smallest_loss[next_best.middle]
         sentence += (
-            f" Next best: {next_best.plan.name} ({found.question.crossings} crossings then detect "
+            f" Next best: {next_best.plan.label} ({found.question.crossings} crossings then detect "
             f"a loss of {percent(smallest)})."
         )
     return sentence

@@ -23,11 +23,19 @@ _MOVED: Final = 0.12
 """Shift of the load to the heavier axle, relative to the wheelbase, where both are alike."""
 
 
+_OTHER_WAY = "half of the runs the other way"
+
+
 class Plan(NamedTuple):
     """Crossings in equal numbers; those of one tuple are one wheel-path group."""
 
     name: str
     tracks: tuple[tuple[PlannedCrossing, ...], ...]
+
+    @property
+    def label(self) -> str:
+        """Name as printed: JSON keeps that of the first version."""
+        return "half in the other direction" if self.name == _OTHER_WAY else self.name
 
     @property
     def site(self) -> Site:
@@ -58,7 +66,7 @@ def alternatives(site: Site, speed_m_per_s: float) -> Iterator[Plan]:
             (_spread(_with_vehicle(site, _moved(vehicle)), speed_m_per_s),),
         )
     yield Plan(
-        "half of the runs the other way",
+        _OTHER_WAY,
         (planned, tuple(crossing._replace(forward=False) for crossing in planned)),
     )
     quiet = tuple(_QUIETER * density for density in site.sensor.noise_density_ug_per_rthz)

@@ -95,7 +95,7 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     yield f"crossings until the loss is detected with {wanted} probability at midspan; at both"
     yield f"ends (elsewhere between the two numbers); –: more than {MAX_CROSSINGS};"
     yield "at … t: only if legal axle and total loads allow it;"
-    yield "the other way: in the other direction, in the opposite lane;"
+    yield "in the other direction: in the opposite lane;"
     yield "… elements: fewer, longer ones"
     yield ""
     for line in warnings(found):
@@ -145,7 +145,7 @@ def _elements(found: SurveyForecast) -> list[list[str]]:
 
 def _comparison(found: SurveyForecast) -> list[list[str]]:
     rows = [["what if", "overall", "mid", "seen", "smallest", "needed", "ends"]]
-    rows += [_cells(one, one.plan.name) for one in (found.planned, *found.others)]
+    rows += [_cells(one, one.plan.label) for one in (found.planned, *found.others)]
     rows += [
         [
             f"at {at.speed_m_per_s:g} m/s",

@@ -52,7 +52,7 @@ def test_lines_into_a_pipe(
     )
     try:
         assert watch.stdout is not None
-        wanted = "truck-1 → bridge-1: good, lowest EI_4 0.400 of nominal (0.377 to 0.424)"
+        wanted = "truck-1 → bridge-1: good, lowest EI_4 0.400 of nominal (95 %: 0.377 to 0.424)"
         for said in watch.stdout:
             found = LINE.fullmatch(said)
             assert found, said

@@ -169,6 +169,8 @@ def test_every_word_of_the_picture_can_be_read() -> None:
 
 def test_lines_fit_on_a_terminal() -> None:
     found = made_up(None, {"half of the runs the other way": 0.2})
+    assert any(line.startswith("half in the other direction  ") for line in lines_of(found))
+    assert not any("other way" in line for line in lines_of(found))
     tables = [line for line in lines_of(found) if not line.startswith(("warning", "Even 300"))]
     assert max(map(len, tables)) <= 80
 

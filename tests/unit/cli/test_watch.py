@@ -127,7 +127,7 @@ def test_lines_for_a_pipe(site: Site) -> None:
         "truck-1 → bridge-1: on the bridge",
         "truck-1 → bridge-1: complete",
         "truck-1 → bridge-1: identifying",
-        "truck-1 → bridge-1: good, lowest EI_4 0.400 of nominal (0.377 to 0.424)",
+        "truck-1 → bridge-1: good, lowest EI_4 0.400 of nominal (95 %: 0.377 to 0.424)",
         "logger is NOT WELL: 3 messages/s, disk full",
     ]
 

@@ -339,7 +339,7 @@ def test_result_defines_the_elements_without_a_site_file(tmp_path: Path, site: S
     assert drawn[name].to_pylist() == [
         ["1.000", "0.980", "1.010", "0.400", "1.020", "1.000", "0.990"]
     ]
-    assert str(lowest_element(outcome)) == "EI_4 0.400 of nominal (0.377 to 0.424)"
+    assert str(lowest_element(outcome)) == "EI_4 0.400 of nominal (95 %: 0.377 to 0.424)"
     assert elements_of_result(result(site)) is None  # no priors in it
     assert lowest_element(result(site)) is None
 
