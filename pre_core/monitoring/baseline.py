@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.constants import SLOPE_SPREAD
 from pre_core.fusion.variability import BETWEEN_SCALE
 from pre_core.monitoring.observation import Observation, SharedError
 
@@ -30,9 +31,8 @@ FloatArray = NDArray[np.float64]
 REFERENCE_DEG_C = 10.0
 LEVEL_SPREAD = 1.0
 """Prior standard deviation of ln EI, nearly uninformative."""
-SLOPE_SPREAD, SLOPE_SPREAD_OWN = 4e-3, 1e-3
-"""Prior of d ln EI/dT in 1/K, common to all elements and own of each: concrete and asphalt lose
-some tenths of a per cent per kelvin."""
+SLOPE_SPREAD_OWN = 1e-3
+"""Prior standard deviation of the part of d ln EI/dT of a single element, 1/K."""
 SEASON_K, HALF_SEASON_K, OFFSET_K, WEATHER_K = 11.0, 3.0, 8.0, 4.0
 """Standard deviations in K of an unknown temperature: of each part of the annual wave, of the
 half-annual wave, of the annual mean, and of a period's weather."""

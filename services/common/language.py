@@ -55,6 +55,11 @@ class Language(NamedTuple):
         """Return a number in a format of `str.format`."""
         return str(self._formatter.format_field(float(value), form))
 
+    def change(self, ratio: float) -> str:
+        """Return the change of a ratio to 1 in per cent, with its sign."""
+        change = round(100.0 * (ratio - 1.0))
+        return f"{self.number(change, '+.0f')} %" if change else "0 %"
+
     def choice(self, key: str, number: int, **values: Any) -> str:
         """Return the sentence `key.one` for one of something, and `key.many` for another number."""
         return self.text(f"{key}.{'one' if number == 1 else 'many'}", number=number, **values)

@@ -21,6 +21,9 @@ Floats = NDArray[np.float64]
 
 CLEAR_LOSS = 0.1
 """Smallest stiffness loss that the whole 95 % interval of a weak element must exceed."""
+IMPLAUSIBLE_GAIN = 0.2
+"""Gain above which no whole 95 % interval of an element is plausible: from summer to winter,
+30 K, the stiffness of concrete and asphalt rises by some 12 %."""
 _FEWEST_ELEMENTS = 3
 """Fewest elements: of two the undamaged one cannot be identified."""
 
@@ -56,6 +59,16 @@ class Element(NamedTuple):
         return self.low > 1.0 + CLEAR_LOSS
 
     @property
+    def is_lower(self) -> bool:
+        """Whether its interval excludes no loss at all, but not a loss that is too small."""
+        return self.high < 1.0 and not self.is_weak
+
+    @property
+    def is_implausible(self) -> bool:
+        """Whether it is stiffer than damage, weather and chance explain."""
+        return self.low > 1.0 + IMPLAUSIBLE_GAIN
+
+    @property
     def visible_loss(self) -> float:
         """Smallest loss of this element that would have been clear."""
         return 1.0 - (1.0 - CLEAR_LOSS) * self.ratio / self.high
@@ -78,6 +91,16 @@ class Comparison(NamedTuple):
     def stiff(self) -> tuple[Element, ...]:
         """Clearly stiffer elements."""
         return tuple(element for element in self.elements if element.is_stiff)
+
+    @property
+    def lower(self) -> tuple[Element, ...]:
+        """Elements that have lost stiffness, but not clearly."""
+        return tuple(element for element in self.elements if element.is_lower)
+
+    @property
+    def implausible(self) -> tuple[Element, ...]:
+        """Elements that are stiffer than damage, weather and chance explain."""
+        return tuple(element for element in self.elements if element.is_implausible)
 
     @property
     def rest(self) -> tuple[Element, ...]:

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from schemas.results import CrossingResult
 from services.common.language import Language
 from services.report.bridge import BridgeReport
+from services.report.cautions import named_elements, possibly_weak, weak_before
 from services.report.place import position_of
 
 
@@ -17,12 +18,20 @@ def next_steps(report: BridgeReport, language: Language) -> Iterator[str]:
     match report.finding.kind:
         case "weak":
             yield from _inspect(report, language)
+            yield language.text("advice.look")
+            yield from _earlier(report, language)
             yield from _implausible(report, language)
+            yield from _stiffer(report, language)
             yield from _drive_again(report, language)
         case "sound":
             yield language.text("advice.sound")
+            yield from _possibly(report, language)
+            yield from _earlier(report, language)
         case "open":
             yield language.text("advice.not_ruled_out")
+            yield from _possibly(report, language)
+            yield from _earlier(report, language)
+            yield from _implausible(report, language)
             if report.view.comparison is not None:
                 yield language.text("advice.open")
                 yield language.text("advice.open_truck")
@@ -67,14 +76,39 @@ def _inspect(report: BridgeReport, language: Language) -> Iterator[str]:
     yield step if report.before is not None else f"{step} {language.text('advice.unlike')}"
 
 
+def _possibly(report: BridgeReport, language: Language) -> Iterator[str]:
+    """Yield the elements that an inspection begins with where none is clearly weak."""
+    numbers = [str(one.number) for one in possibly_weak(report.view)]
+    if numbers:
+        yield language.choice("advice.lower", len(numbers), elements=language.listed(numbers))
+
+
+def _earlier(report: BridgeReport, language: Language) -> Iterator[str]:
+    """Yield that an element which was weak in the baseline is still to be inspected."""
+    now = () if report.view.comparison is None else report.view.comparison.weak
+    known = {one.number for one in now}
+    weak = [one.number for one in weak_before(report.view, report.before)]
+    numbers = [str(number) for number in weak if number not in known]
+    if numbers:
+        yield language.choice("advice.earlier", len(numbers), elements=language.listed(numbers))
+
+
 def _implausible(report: BridgeReport, language: Language) -> Iterator[str]:
+    """Yield what to do about elements that are stiffer than is plausible."""
+    found = () if report.view.comparison is None else report.view.comparison.implausible
+    if found:
+        elements = named_elements([one.number for one in found], language)
+        yield language.text("advice.implausible", elements=elements)
+
+
+def _stiffer(report: BridgeReport, language: Language) -> Iterator[str]:
     """Yield what an element that is clearly stiffer means for the others: errors are opposite."""
-    comparison = report.view.comparison
-    stiff = [one for one in comparison.elements if one.is_stiff] if comparison is not None else []
-    if stiff:
-        numbers = language.listed([str(one.number) for one in stiff])
+    stiff = () if report.view.comparison is None else report.view.comparison.stiff
+    numbers = [str(one.number) for one in stiff if not one.is_implausible]
+    if numbers:
         against = "others" if report.before is None else "baseline"
-        yield language.choice(f"advice.stiffer.{against}", len(stiff), elements=numbers)
+        listed = language.listed(numbers)
+        yield language.choice(f"advice.stiffer.{against}", len(numbers), elements=listed)
 
 
 def _drive_again(report: BridgeReport, language: Language) -> Iterator[str]:

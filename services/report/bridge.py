@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from schemas.results import BridgeResult, CrossingResult, Results, load_results
+from schemas.results import BridgeResult, CrossingResult, Results
 from schemas.site import Bridge, Site
 from services.common.errors import InputError
 from services.common.extras import check_extras
@@ -19,7 +19,8 @@ from services.history.bridge_history import BridgeHistory, bridge_history
 from services.history.history_store import bridges_of
 from services.history.periods import Unit
 from services.identification.comparison import Comparison, Estimate, compare, per_cent_up
-from services.viewer.baseline import named_baseline, stored_baseline
+from services.report.cautions import Measured, cautions
+from services.report.earlier import Before, SurveyFile, before_of, combined_surveys
 from services.viewer.bridge_view import BridgeView, describe_bridge, view_of_bridge
 
 _LATEST_S = 7_258_118_400.0
@@ -41,17 +42,6 @@ class BridgeFinding(NamedTuple):
     sentences: tuple[str, ...]
 
 
-class Before(NamedTuple):
-    """The earlier measurement that a bridge is compared with."""
-
-    name: str
-    """Name of its results file."""
-    estimate: Estimate
-    verdict: str
-    crossings: tuple[CrossingResult, ...]
-    """Crossings that it includes, in order of time, as far as its file has them."""
-
-
 class BridgeReport(NamedTuple):
     """One bridge in a report."""
 
@@ -68,6 +58,8 @@ class BridgeReport(NamedTuple):
     before: Before | None
     finding: BridgeFinding
     quality: str
+    cautions: tuple[str, ...] = ()
+    """Sentences on what limits the finding, or belongs next to it."""
     past: BridgeHistory | None = None
     """History of the bridge, if one was given."""
 
@@ -155,9 +147,11 @@ def _report(
     bridges = {} if state is None else {name: state}
     merged = last.model_copy(update={"crossings": crossings, "bridges": bridges})
     bridge = site.bridge(name)
-    before = _before(bridge, baseline, path, beside)
+    before = before_of(bridge, baseline, path, beside)
     stored = None if before is None else before.estimate
     view = view_of_bridge(bridge, merged, stored)
+    used = tuple(crossing for crossing in crossings if crossing.crossing_id in view.used)
+    combined = None if before is not None else combined_surveys(_survey_files(name, about), used)
     return BridgeReport(
         bridge,
         view,
@@ -169,7 +163,17 @@ def _report(
         before,
         _finding(view, crossings, stored, language),
         _quality(view, crossings, language),
+        tuple(cautions(Measured(bridge, view, used, before, combined), language)),
     )
+
+
+def _survey_files(name: str, files: Sequence[tuple[Path, Results, Site]]) -> list[SurveyFile]:
+    """Return the files of a bridge with the times of its crossings."""
+    found = []
+    for path, results, _ in files:
+        times = [c.entry_time for c in results.crossings if c.bridge == name]
+        found.append(SurveyFile(path.name, min(times), max(times)))
+    return found
 
 
 def _latest_state(
@@ -201,24 +205,6 @@ def _state_of_all(
 
     with one_blas_thread():
         return fuse_bridge(name, [c for c in crossings if c.realm == realm])
-
-
-def _before(
-    bridge: Bridge, given: Path | None, results: Path, beside: Path | None
-) -> Before | None:
-    """Return the baseline: the given one, or that of the site file."""
-    if given is None:
-        folder = beside or results.parent
-        if named_baseline(bridge, folder, required=beside is not None)[0] is None:
-            return None
-        assert bridge.baseline is not None  # noqa: S101 - it was read
-        given = folder / bridge.baseline
-    estimate, name = stored_baseline(bridge, given)
-    stored = load_results(given)
-    state = stored.bridges[bridge.id]
-    used = (one for one in stored.crossings if one.crossing_id in state.crossings_used)
-    crossings = tuple(sorted(used, key=lambda crossing: crossing.entry_time))
-    return Before(name, estimate, state.verdict or "good", crossings)
 
 
 def _one_by_one(
@@ -271,16 +257,28 @@ def _finding(
     if view.comparison is None:
         return BridgeFinding("open", language.text("finding.incomparable"), wording)
     weak = view.comparison.weak
+    but = _but_implausible(view.comparison, language)
     if weak and view.ambiguous_neighbours:
         numbers = language.listed([str(one.number) for one in weak])
         headline = language.choice("finding.near", len(weak), elements=numbers)
-        return BridgeFinding("weak", headline, wording)
+        return BridgeFinding("weak", headline + but, wording)
     if weak:
-        return BridgeFinding("weak", language.choice("finding.weak", len(weak)), wording)
+        key = "finding.appears" if but else "finding.weak"
+        return BridgeFinding("weak", language.choice(key, len(weak)) + but, wording)
     missed = _why_open(view, view.comparison, language)
     if missed is None:
-        return BridgeFinding("sound", language.text("finding.none"), wording)
-    return BridgeFinding("open", missed, (*wording, _seen(view.comparison, language)))
+        kind = "open" if but else "sound"
+        return BridgeFinding(kind, language.text("finding.none") + but, wording)
+    return BridgeFinding("open", missed + but, (*wording, _seen(view.comparison, language)))
+
+
+def _but_implausible(found: Comparison, language: Language) -> str:
+    """Return what a headline adds if elements are implausibly stiff; empty if none is."""
+    numbers = [str(element.number) for element in found.implausible]
+    if not numbers:
+        return ""
+    listed = language.listed(numbers)
+    return " " + language.choice("finding.implausible", len(numbers), elements=listed)
 
 
 def _why_open(view: BridgeView, found: Comparison, language: Language) -> str | None:
@@ -355,8 +353,12 @@ def _quality(view: BridgeView, crossings: Sequence[CrossingResult], language: La
         parts.append(language.choice("quality.other_realm", number, realms=realms))
     if view.estimate is None:
         return " ".join((*parts, language.text("quality.none")))
+    last = list(_excluded(view, crossings, language))
+    if view.comparison is not None and view.comparison.implausible and not view.is_doubtful:
+        last.append(language.text("quality.implausible"))
     if view.state is not None and len(view.used) > 1:
-        return " ".join((*parts, *_together(view.state, len(crossings), language)))
+        together = _together(view.state, len(crossings), language)
+        return " ".join((*parts, *together, *last))
     others = [c for c in crossings if c.verdict == "good" and c.crossing_id not in view.used]
     parts.append(language.text("quality.this" if len(crossings) == 1 else "quality.newest"))
     if view.state is not None and view.state.between_crossing_std is not None:
@@ -367,7 +369,7 @@ def _quality(view: BridgeView, crossings: Sequence[CrossingResult], language: La
     else:
         which = "agree" if deviation <= _LARGEST_DEVIATION else "disagree"
         parts.append(language.choice(f"quality.{which}", len(others), deviation=deviation))
-    return " ".join(parts)
+    return " ".join((*parts, *last))
 
 
 def _together(state: BridgeResult, crossings: int, language: Language) -> Iterator[str]:
@@ -375,12 +377,6 @@ def _together(state: BridgeResult, crossings: int, language: Language) -> Iterat
     used = len(state.crossings_used)
     which = "quality.all_together" if used == crossings else "quality.some_together"
     yield language.text(which, number=used, verdict=language.text(state.verdict or "good"))
-    left = Counter(
-        language.left_out.get(one.reason, one.reason) for one in state.crossings_left_out
-    )
-    if left:
-        reasons = "; ".join(f"{n} {why}" for why, n in left.most_common())
-        yield language.text("quality.left_out", reasons=reasons)
     low, high = state.between_crossing_std_q025, state.between_crossing_std_q975
     if state.between_crossing_std is not None and low is not None and high is not None:
         yield language.text(
@@ -389,6 +385,32 @@ def _together(state: BridgeResult, crossings: int, language: Language) -> Iterat
             low=100.0 * low,
             high=100.0 * high,
         )
+
+
+def _excluded(
+    view: BridgeView, crossings: Sequence[CrossingResult], language: Language
+) -> Iterator[str]:
+    """Yield how many crossings of the campaign are not in the numbers, and why."""
+    own = [one for one in crossings if one.realm == crossings[-1].realm]
+    left_out = () if view.state is None else view.state.crossings_left_out
+    verdicts = {one.crossing_id: one.verdict for one in own if one.crossing_id not in view.used}
+    reasons = []
+    for verdict in ("rejected", "suspect"):
+        some = [one for one in own if verdicts.get(one.crossing_id) == verdict]
+        why = Counter(text for crossing in some for text in reasons_of(crossing, language))
+        listed = " ".join(text for text, _ in why.most_common(_MAX_REASONS))
+        why_text = listed.removesuffix(".")
+        values = {"number": len(some), "verdict": language.text(verdict), "why": why_text}
+        if some:
+            reasons.append(language.text("quality.left_out_because", **values))
+    counted = Counter(
+        language.left_out.get(one.reason, one.reason)
+        for one in left_out
+        if verdicts.get(one.crossing_id, "good") == "good"
+    )
+    reasons += [f"{number} {why}" for why, number in counted.most_common()]
+    if reasons:
+        yield language.text("quality.left_out", reasons="; ".join(reasons))
 
 
 def _largest_deviation(estimate: Estimate, others: Sequence[CrossingResult]) -> float | None:

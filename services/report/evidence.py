@@ -214,8 +214,6 @@ def measures_of(crossing: CrossingResult, language: Language) -> Iterator[Measur
     road = crossing.road
     if road is not None and road.iri_m_per_km is not None:
         yield Measure("iri", "iri", language.number(road.iri_m_per_km, ".1f"))
-    if road is not None and road.iso_class is not None:
-        yield Measure("class", "class", road.iso_class)
     for key in _DIAGNOSTICS:
         if key in crossing.diagnostics:
             value = crossing.diagnostics[key]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 
@@ -10,9 +11,10 @@ import matplotlib
 from schemas.results import CrossingResult
 from services.common.language import ENGLISH, Language
 from services.common.progress import Steps, no_step_progress
-from services.identification.comparison import Comparison, Element, per_cent_up
+from services.identification.comparison import Element
 from services.report.advice import next_steps
 from services.report.bridge import BridgeReport, reasons_of
+from services.report.cautions import weak_before
 from services.report.evidence import evidence, facts, pictured
 from services.report.history_section import history_section, history_summary
 from services.report.html import Html, inlined_svg, joined, table, tag
@@ -23,6 +25,10 @@ from services.viewer.bridge_figure import draw_bridge
 from services.viewer.drawing import STYLE, figure_bytes
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+
+_TAG = re.compile(r"<[^>]*>")
+_DOUBTFUL = ("weak", "stiff", "implausible", "lower")
+"""Remarks that a doubtful measurement cannot make."""
 
 
 def page(
@@ -76,7 +82,8 @@ def _bridge(
         tag(
             "div",
             tag("strong", finding.headline),
-            *(tag("p", sentence) for sentence in finding.sentences),
+            *(tag("p", text) for text in _paragraphs(report)),
+            *([_list(report.cautions)] if report.cautions else []),
             class_=f"finding {finding.kind}",
         ),
         tag("div", _facts(report, language), sketch(report, language), class_="about"),
@@ -85,7 +92,7 @@ def _bridge(
         _list(next_steps(report, language)),
         tag("h2", language.text("heading.not_meant")),
         _list(_not_meant(report, language)),
-        *_caveats(report, language),
+        tag("p", language.text("page.signature"), class_="signature"),
         class_="first",
     )
     past = Html("")
@@ -93,18 +100,31 @@ def _bridge(
         past = history_section(report.past, f"{prefix}h-", language)
         drawn()
     heading = tag("h2", language.text("heading.evidence"))
-    proof = tag("section", heading, *evidence(report, f"{prefix}c-", language), class_="evidence")
+    proof = tag(
+        "section",
+        heading,
+        *_caveats(report, language),
+        *evidence(report, f"{prefix}c-", language),
+        class_="evidence",
+    )
     if pictured(report):
         drawn()
     body = joined(first, past, proof)
+    seen = _TAG.sub(" ", body)
     meanings = (
         tag("p", tag("strong", f"{one.word}:"), f" {one.meaning}")
         for one in language.glossary
-        if any(part in body for part in one.seen_by)
+        if any(part in seen for part in one.seen_by)
     )
     words = tag("h2", language.text("heading.words"))
-    signature = tag("p", language.text("page.signature"), class_="signature")
-    return joined(body, tag("section", words, *meanings, class_="words"), signature)
+    return joined(body, tag("section", words, *meanings, class_="words"))
+
+
+def _paragraphs(report: BridgeReport) -> list[str]:
+    """Return a paragraph for each clear element, and one of all other sentences."""
+    comparison, sentences = report.view.comparison, report.finding.sentences
+    clear = 0 if comparison is None else len(comparison.weak) + len(comparison.stiff)
+    return [*sentences[:clear], *([" ".join(sentences[clear:])] if sentences[clear:] else [])]
 
 
 def _list(items: Iterator[str] | Sequence[str]) -> Html:
@@ -115,7 +135,8 @@ def _not_meant(report: BridgeReport, language: Language) -> Sequence[str]:
     if report.view.estimate is None:
         which = "no_number" if report.finding.kind == "nothing" else "doubtful"
         return (language.text(f"not_meant.{which}"),)
-    return [language.text(f"not_meant.{key}") for key in ("rating", "line", "other", "simulated")]
+    other = "other_alone" if report.before is None else "other"
+    return [language.text(f"not_meant.{key}") for key in ("rating", "line", other, "simulated")]
 
 
 def _facts(report: BridgeReport, language: Language) -> Html:
@@ -199,7 +220,7 @@ def _elements(report: BridgeReport, language: Language) -> Html:
     for n, mean in enumerate(view.estimate.mean):
         low, high = view.estimate.low[n] / 1e9, view.estimate.high[n] / 1e9
         element = compared[n] if compared else None
-        remark = _remark(element, is_resolved=n + 1 not in view.unresolved)
+        remark = _remark(n + 1, report)
         ratio = language.number(mean / view.nominal_nm2[n], ".3f")
         change = "" if element is None else _change(element, language)
         ends = {"from_m": view.edges_m[n], "to_m": view.edges_m[n + 1]}
@@ -211,20 +232,28 @@ def _elements(report: BridgeReport, language: Language) -> Html:
             old = (before.estimate.mean[n], before.estimate.low[n], before.estimate.high[n])
             row += [_value(*old, language), _value(mean, 1e9 * low, 1e9 * high, language)]
             row.append(change)
-        doubt = "?" if remark in ("weak", "stiff") and view.is_doubtful else ""
+        doubt = (
+            "?" if remark in ("weak", "stiff", "implausible", "lower") and view.is_doubtful else ""
+        )
         row.append(language.text(f"remark.{remark}") + doubt if remark else "")
         rows.append(row)
         classes.append(remark if remark == "weak" and not view.is_doubtful else "")
     return table([language.text(f"table.{key}") for key in keys], rows, classes)
 
 
-def _remark(element: Element | None, *, is_resolved: bool) -> str:
+def _remark(number: int, report: BridgeReport) -> str:
     """Return the key of the remark on an element; empty for none."""
+    comparison = report.view.comparison
+    element = None if comparison is None else comparison.elements[number - 1]
     if element is not None and element.is_weak:
         return "weak"
     if element is not None and element.is_stiff:
-        return "stiff"
-    return "" if is_resolved else "unresolved"
+        return "implausible" if element.is_implausible else "stiff"
+    if number in report.view.unresolved:
+        return "unresolved"
+    if number in {one.number for one in weak_before(report.view, report.before)}:
+        return "earlier"
+    return "lower" if element is not None and element.is_lower else ""
 
 
 def _value(mean: float, low: float, high: float, language: Language) -> str:
@@ -232,7 +261,7 @@ def _value(mean: float, low: float, high: float, language: Language) -> str:
 
 
 def _change(element: Element, language: Language) -> str:
-    ratio, low, high = (_signed(r, language) for r in (element.ratio, element.low, element.high))
+    ratio, low, high = (language.change(r) for r in (element.ratio, element.low, element.high))
     return language.text("cell.change", ratio=ratio, low=low, high=high)
 
 
@@ -246,24 +275,12 @@ def _caveats(report: BridgeReport, language: Language) -> Iterator[Html]:
     notes = [language.text("note.change")]
     if comparison.reference == "others":
         notes = [language.text("note.no_baseline", median=comparison.median_ratio)]
-    if report.finding.kind != "open":  # there the finding itself states it
-        notes.append(_visible(comparison, language))
     yield tag("p", " ".join(notes), class_="note")
-
-
-def _visible(comparison: Comparison, language: Language) -> str:
-    losses = sorted(element.visible_loss for element in comparison.elements)
-    return language.text("note.visible", low=per_cent_up(losses[0]), high=per_cent_up(losses[-1]))
 
 
 def _name(report: BridgeReport) -> str:
     bridge = report.bridge
     return bridge.id if bridge.owner_id is None else f"{bridge.owner_id} ({bridge.id})"
-
-
-def _signed(ratio: float, language: Language) -> str:
-    change = round(100.0 * (ratio - 1.0))
-    return f"{language.number(change, '+.0f')} %" if change else "0 %"
 
 
 def _day(seconds: float) -> str:

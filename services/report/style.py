@@ -3,7 +3,7 @@
 from services.common.language import Language
 
 _CSS = """
-@page { size: A4; margin: 11mm 15mm 14mm; @bottom-right { content: "PAGE_NUMBER";
+@page { size: A4; margin: 9mm 15mm 12mm; @bottom-right { content: "PAGE_NUMBER";
   font: 8pt "DejaVu Sans", Verdana, Arial, sans-serif; color: #5b6570; } }
 * { box-sizing: border-box; }
 body { font: 10.5pt/1.38 "DejaVu Sans", Verdana, Arial, sans-serif; color: #1b1f24;
@@ -16,6 +16,7 @@ ul { padding-left: 5mm; }
 .sub { color: #5b6570; }
 .finding { border: 1.2pt solid #5b6570; border-left-width: 6pt; padding: 2mm 3mm; margin: 2.5mm 0; }
 .finding strong { font-size: 12.5pt; }
+.finding ul { border-top: 0.5pt solid #b9bfc5; margin: 1.5mm 0 0; padding-top: 1mm; }
 .finding.weak { border-color: #8a4b00; background: #fdf0d5; }
 .finding.sound { border-color: #00694d; background: #eef7f3; }
 .finding.open { background: #f3f5f7; }
@@ -43,7 +44,7 @@ svg { width: 100%; height: auto; display: block; }
 .many.measures td:first-child { white-space: normal; width: 44%; }
 .many.measures td:last-child { font-size: inherit; color: inherit; white-space: nowrap; }
 .measures small { color: #3d4650; }
-.signature { border-top: 0.8pt solid #5b6570; padding-top: 1mm; margin-top: 9mm; width: 60%;
+.signature { border-bottom: 0.8pt solid #5b6570; padding-bottom: 6mm; margin-top: 3mm;
   font-size: 9pt; color: #5b6570; }
 .words { border-top: 0.8pt solid #5b6570; font-size: 9pt; margin-top: 3mm; }
 tr.suspect td:first-child::before { content: "○ "; }
@@ -58,31 +59,39 @@ tr.good td:first-child::before { content: "● "; }
   .wide table { width: max-content; min-width: 100%; }
   .wide td { max-width: 62mm; overflow-wrap: break-word; }
   figure.wide svg { width: 640px; }
-  .signature { width: 100%; }
 }
 @media print {
-  body { padding: 0; font-size: 9.5pt; line-height: 1.31; }
+  body { padding: 0; font-size: 9.2pt; line-height: 1.28; }
+  h1 { font-size: 15pt; }
+  .sub { margin: 0; font-size: 8pt; }
+  .finding { padding: 1.2mm 3mm; margin: 1.5mm 0; }
+  .finding strong { font-size: 11.5pt; }
   figure, tr, .finding { break-inside: avoid; }
-  .evidence, .past, .words + .first { break-before: page; }
+  .past, .words + .first { break-before: page; }
   .evidence table { font-size: 8.2pt; }
-  .evidence figure svg { max-height: 58mm; }
+  .evidence figure svg { max-height: 54mm; }
   .measures table { font-size: 7.8pt; }
   .measures td, .measures th { padding-top: 0.2mm; padding-bottom: 0.2mm; line-height: 1.25; }
   .note.how { display: none; }
   .past figure svg { max-height: 175mm; }
-  .first figure.wide svg { max-height: 45mm; }
+  .first figure.wide svg { max-height: 41mm; }
   .wide { overflow: visible; }
-  h2, h3 { break-after: avoid; margin-top: 2mm; }
-  .words { columns: 2; column-gap: 6mm; font-size: 7.5pt; line-height: 1.22; margin-top: 2mm; }
+  h2, h3 { break-after: avoid; margin: 1.5mm 0 0; }
+  h2 { font-size: 11pt; }
+  .first p, .first ul { margin: 0.6mm 0; }
+  .words { columns: 3; column-gap: 5mm; font-size: 7pt; line-height: 1.2; margin-top: 2mm; }
   .words h2 { font-size: 10pt; margin: 1mm 0 0; column-span: all; }
   .words p { break-inside: avoid; margin: 0.5mm 0; }
   .finding p { margin: 0.3mm 0; }
-  .note, .first ul { font-size: 8pt; line-height: 1.25; }
-  :lang(de) .first { font-size: 8.8pt; }
+  .note, .first ul, .evidence ul { font-size: 7.8pt; line-height: 1.23; }
+  .first { font-size: 8.8pt; }
+  :lang(de) .first { font-size: 8.6pt; }
   :lang(de) .note, :lang(de) .first ul { font-size: 7.4pt; line-height: 1.22; }
-  .first table { font-size: 8.4pt; line-height: 1.3; margin: 1mm 0; }
+  .first table { font-size: 8.2pt; line-height: 1.22; margin: 1mm 0; }
+  .first th, .first td { padding-top: 0.3mm; padding-bottom: 0.3mm; }
   .sketch { flex-basis: 30mm; margin: 0; }
-  .signature { margin-top: 7mm; break-inside: avoid; break-before: avoid; }
+  .signature { margin: 1.5mm 0 0; padding-bottom: 3.5mm; font-size: 8pt;
+    break-inside: avoid; break-before: avoid; }
   * { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
 }
 """

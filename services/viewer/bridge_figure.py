@@ -46,6 +46,8 @@ from services.viewer.drawing import (
 _MAX_LISTED = 12
 _BEFORE, _AFTER = (0.02, 0.42), (0.42, 1.0)
 """Parts of an element that the bars of baseline and state take."""
+_ABOVE_LEGEND_PT = 22.0
+"""Distance of the title from the panel, with the legend between them, in points."""
 _SIGNS = {"good": "●", "suspect": "○", "rejected": "×"}
 """Signs of the verdicts, distinguishable without colour."""
 
@@ -66,7 +68,7 @@ def draw_bridge(
     """
     listed = min(len(bridge.crossings), _MAX_LISTED + 1) if with_heading else 0
     lines = _heading(bridge) if with_heading else []
-    heading_in = 1.15 + 0.17 * max(0, len(lines) - 2) if with_heading else 0.35
+    heading_in = 1.35 + 0.17 * max(0, len(lines) - 2) if with_heading else 0.55
     # On a page of its own the width limits the size of its text.
     panel_in, list_in = 3.6 if with_heading else 1.8, 0.2 * listed
     list_in += 0.35 if listed else 0.0
@@ -84,7 +86,6 @@ def draw_bridge(
 
 def _draw_panel(axes: Axes, bridge: BridgeView, language: Language) -> None:
     nominal = bridge.nominal_nm2 / 1e9
-    axes.set_title(language.text("figure.rigidity"))
     axes.set_ylabel(language.text("figure.ei"))
     label = language.text("figure.nominal")
     axes.stairs(nominal, bridge.edges_m, baseline=None, label=label, **NOMINAL_LINE)
@@ -95,9 +96,14 @@ def _draw_panel(axes: Axes, bridge: BridgeView, language: Language) -> None:
         top = max(top, _draw_state(axes, bridge, language))
     axes.set_ylim(0.0, top)
     legend_beside_title(axes)
+    title = language.text("figure.rigidity")
+    if bridge.estimate is not None:
+        title += f" {language.text(f'figure.numbers_{_meaning(bridge)}')}"
+    axes.set_title(title, pad=_ABOVE_LEGEND_PT)
     simplify_axes(axes)
     simplify_numbers(axes, language)
-    add_ratio_axis(axes, nominal, language)
+    if _meaning(bridge) == "ratio":
+        add_ratio_axis(axes, nominal, language)
     mark_bridge(axes, (0.0, *bridge.interior_supports_m, bridge.span_m))
     axes.set_xlim(-0.03 * bridge.span_m, 1.03 * bridge.span_m)
     axes.set_xlabel(language.text("figure.chainage"))
@@ -127,18 +133,32 @@ def _draw_state(axes: Axes, bridge: BridgeView, language: Language) -> float:
     label = language.text("figure.interval")
     draw_intervals(axes, places, low, high, colour=colour, label=label)
     tops = np.maximum(high, _draw_crossings(axes, bridge, places, language))
-    ratios = mean / (bridge.nominal_nm2 / 1e9)
-    label_bars(axes, places, low, tops, [language.number(ratio, ".3f") for ratio in ratios])
+    label_bars(axes, places, low, tops, _numbers(bridge, mean, language))
     doubt = "?" if bridge.is_doubtful else ""
-    losses = {
-        element.number: language.text(
-            "figure.less", loss=100.0 * (1.0 - element.ratio), doubt=doubt
-        )
-        for element in weak
-    }
+    losses = {}
+    if _meaning(bridge) == "ratio":  # otherwise the numbers themselves are the changes
+        losses = {
+            element.number: language.text(
+                "figure.less", loss=100.0 * (1.0 - element.ratio), doubt=doubt
+            )
+            for element in weak
+        }
     label_losses(axes, places, low, tops, losses)
     highest = max(highest, float(tops.max()))
     return max(1.1 * highest, top_above_labels(axes, low, tops, losses))
+
+
+def _meaning(bridge: BridgeView) -> str:
+    """Return what the numbers in a figure are: its `ratio` to nominal, or the `change`."""
+    return "ratio" if bridge.baseline is None or bridge.comparison is None else "change"
+
+
+def _numbers(bridge: BridgeView, mean: FloatArray, language: Language) -> list[str]:
+    """Return the number of each bar, all with one meaning."""
+    if _meaning(bridge) == "change":
+        assert bridge.comparison is not None  # noqa: S101 - its meaning says so
+        return [language.change(element.ratio) for element in bridge.comparison.elements]
+    return [language.number(ratio, ".3f") for ratio in mean / (bridge.nominal_nm2 / 1e9)]
 
 
 def _draw_before(axes: Axes, bridge: BridgeView, places: BarPlaces, language: Language) -> float:

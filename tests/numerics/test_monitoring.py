@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pre_core.constants import SLOPE_SPREAD
 from pre_core.monitoring.baseline import (
-    SLOPE_SPREAD,
     BaselineState,
     Period,
     Scales,

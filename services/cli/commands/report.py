@@ -82,7 +82,8 @@ def _report(asked: ReportOptions) -> int:
         text = page(reports, progress, language)
     write_atomically(output, text)
     for report in reports:
-        print(f"{report.bridge.id}: {report.finding.headline} {' '.join(report.finding.sentences)}")
+        sentences = (report.finding.headline, *report.finding.sentences, *report.cautions)
+        print(f"{report.bridge.id}: {' '.join(sentences)}")
     if not reports:
         print("no crossing of a known bridge")
     if asked.baseline is None and len(files) > 1:

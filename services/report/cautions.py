@@ -1,0 +1,196 @@
+"""Cautions on the first page: what limits a finding, or belongs next to it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from typing import NamedTuple
+
+import numpy as np
+
+from pre_core.constants import SLOPE_SPREAD
+from schemas.results import CrossingResult
+from schemas.site import Bridge
+from services.common.language import Language
+from services.identification.comparison import (
+    CLEAR_LOSS,
+    IMPLAUSIBLE_GAIN,
+    Comparison,
+    Element,
+    compare,
+)
+from services.report.earlier import Before, Combined, days_between, season_of
+from services.report.place import ends_of
+from services.viewer.bridge_view import BridgeView
+
+_LIKELY = 0.9
+"""Probability from which a restrained or yielding end is stated on the first page."""
+_MOST = 0.99
+"""Largest probability that is stated: draws cannot show certainty."""
+_APART_DAYS = 30
+"""Days from which the dates of two surveys are a caution."""
+_WARMER_K = 20.0
+"""Difference of temperature in K by which the effect of a season is illustrated."""
+
+
+class Measured(NamedTuple):
+    """The measurement that cautions are about."""
+
+    bridge: Bridge
+    view: BridgeView
+    crossings: tuple[CrossingResult, ...]
+    """Crossings behind the numbers, in order of time."""
+    before: Before | None
+    combined: Combined | None
+
+
+def cautions(measured: Measured, language: Language) -> Iterator[str]:
+    """Yield the cautions on a finding, the most important one first."""
+    if measured.view.estimate is None:
+        return
+    comparison = measured.view.comparison
+    if comparison is not None:
+        yield from _implausible(comparison, language)
+        yield from _lower(measured.view, comparison, language)
+        if comparison.weak or 2 * len(measured.view.unresolved) <= len(comparison.elements):
+            limit = 100.0 * CLEAR_LOSS
+            yield language.text(f"caution.clearly.{comparison.reference}", limit=limit)
+    yield from _earlier(measured, language)
+    yield from _seasons(measured, language)
+    yield from _combined(measured.combined, language)
+    yield from _ends(measured, language)
+
+
+def possibly_weak(view: BridgeView) -> tuple[Element, ...]:
+    """Return the resolved elements whose interval excludes no loss, but not a small one."""
+    lower = () if view.comparison is None else view.comparison.lower
+    return tuple(element for element in lower if element.number not in view.unresolved)
+
+
+def weak_before(view: BridgeView, before: Before | None) -> tuple[Element, ...]:
+    """Return the elements that were clearly less stiff than the others in the baseline."""
+    if before is None:
+        return ()
+    found = compare(before.estimate, view.nominal_nm2, view.edges_m)
+    return () if found is None else found.weak
+
+
+def named_elements(numbers: Sequence[int], language: Language) -> str:
+    """Return `element 3` or `elements 3 and 5`."""
+    which = "caution.element" if len(numbers) == 1 else "caution.elements"
+    return language.text(which, elements=language.listed([str(number) for number in numbers]))
+
+
+def _implausible(comparison: Comparison, language: Language) -> Iterator[str]:
+    numbers = [element.number for element in comparison.implausible]
+    if not numbers:
+        return
+    beside = {n + side for n in numbers for side in (-1, 1)} - set(numbers)
+    near = [n for n in sorted(beside) if 1 <= n <= len(comparison.elements)]
+    yield language.text(
+        f"caution.implausible.{comparison.reference}",
+        elements=named_elements(numbers, language),
+        limit=100.0 * IMPLAUSIBLE_GAIN,
+        neighbours=named_elements(near, language),
+    )
+
+
+def _lower(view: BridgeView, comparison: Comparison, language: Language) -> Iterator[str]:
+    elements = possibly_weak(view)
+    if elements:
+        listed = [
+            language.text(
+                "caution.change",
+                number=one.number,
+                **{end: language.change(getattr(one, end)) for end in ("ratio", "low", "high")},
+            )
+            for one in elements
+        ]
+        yield language.choice(
+            "caution.lower",
+            len(elements),
+            elements=language.listed(listed),
+            limit=100.0 * CLEAR_LOSS,
+        )
+
+
+def _earlier(measured: Measured, language: Language) -> Iterator[str]:
+    weak = weak_before(measured.view, measured.before)
+    if weak:
+        listed = [
+            language.text(
+                "caution.loss",
+                number=one.number,
+                loss=100.0 * (1.0 - one.ratio),
+                low=100.0 * (1.0 - one.high),
+                high=100.0 * (1.0 - one.low),
+            )
+            for one in weak
+        ]
+        yield language.choice("caution.earlier", len(weak), elements=language.listed(listed))
+
+
+def _seasons(measured: Measured, language: Language) -> Iterator[str]:
+    """Yield how far two compared surveys are apart, and what the temperature does."""
+    before = measured.before
+    if before is None or not before.crossings or not measured.crossings:
+        return
+    then, now = before.crossings[0].entry_time, measured.crossings[0].entry_time
+    days = days_between(then, now)
+    if days < _APART_DAYS:
+        return
+    latitude = measured.bridge.start_latitude_deg
+    earlier, later = season_of(then, latitude), season_of(now, latitude)
+    which = "same_season" if earlier == later else "other_season"
+    yield language.text(
+        f"caution.{which}",
+        days=days,
+        earlier=language.text(earlier),
+        later=language.text(later),
+        kelvin=_WARMER_K,
+        change=100.0 * _WARMER_K * SLOPE_SPREAD,
+    )
+
+
+def _combined(combined: Combined | None, language: Language) -> Iterator[str]:
+    if combined is None:
+        return
+    how = language.text("caution.no_command")
+    if combined.command is not None:
+        how = language.text("caution.command", command=combined.command)
+    yield language.text(
+        "caution.combined",
+        days=days_between(combined.earlier_s, combined.later_s),
+        earlier=_day(combined.earlier_s),
+        later=_day(combined.later_s),
+        how=how,
+    )
+
+
+def _ends(measured: Measured, language: Language) -> Iterator[str]:
+    """Yield which ends are likely to be restrained or to yield, unless that is declared."""
+    known = [crossing.derived for crossing in measured.crossings if crossing.derived is not None]
+    is_declared = [bearing == "sprung" for bearing in measured.bridge.bearings]
+    for name, values in (
+        ("restraint", [one.probability_sprung for one in known]),
+        ("compliance", [one.probability_giving for one in known]),
+    ):
+        given = [(one.start, one.end) for one in values if one is not None]
+        if not given:
+            continue
+        ends = [
+            language.text("caution.end", side=side, share=100.0 * min(float(share), _MOST))
+            for side, share, declared in zip(
+                ends_of(measured.bridge, language),
+                np.median(given, axis=0),
+                is_declared if name == "restraint" else (False, False),
+                strict=True,
+            )
+            if share >= _LIKELY and not declared
+        ]
+        if ends:
+            yield language.text(f"caution.{name}", ends=language.listed(ends))
+
+
+def _day(seconds: float) -> str:
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d}"

@@ -1,0 +1,96 @@
+"""Earlier measurements of a bridge: the baseline, and surveys that a report combines."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from schemas.results import CrossingResult, load_results
+from schemas.site import Bridge
+from services.identification.comparison import Estimate
+from services.viewer.baseline import named_baseline, stored_baseline
+
+DAY_S = 86_400.0
+PAUSE_DAYS = 14.0
+"""Pause in days that separates two surveys: in less a bridge seldom changes."""
+_SEASONS = ("winter", "spring", "summer", "autumn")
+
+
+class Before(NamedTuple):
+    """The earlier measurement that a bridge is compared with."""
+
+    name: str
+    """Name of its results file."""
+    estimate: Estimate
+    verdict: str
+    crossings: tuple[CrossingResult, ...]
+    """Crossings that it includes, in order of time, as far as its file has them."""
+
+
+class SurveyFile(NamedTuple):
+    """The crossings of a bridge in one results file: its first and last entry in s since 1970."""
+
+    name: str
+    first_s: float
+    last_s: float
+
+
+class Combined(NamedTuple):
+    """Two surveys that one state combines; the pause between them in s since 1970."""
+
+    earlier_s: float
+    later_s: float
+    command: str | None
+    """Command that compares them; None if their results are in one file."""
+
+
+def before_of(
+    bridge: Bridge, given: Path | None, results: Path, beside: Path | None
+) -> Before | None:
+    """Return the baseline: the given one, or that of the site file."""
+    if given is None:
+        folder = beside or results.parent
+        if named_baseline(bridge, folder, required=beside is not None)[0] is None:
+            return None
+        assert bridge.baseline is not None  # noqa: S101 - it was read
+        given = folder / bridge.baseline
+    estimate, name = stored_baseline(bridge, given)
+    stored = load_results(given)
+    state = stored.bridges[bridge.id]
+    used = (one for one in stored.crossings if one.crossing_id in state.crossings_used)
+    crossings = tuple(sorted(used, key=lambda crossing: crossing.entry_time))
+    return Before(name, estimate, state.verdict or "good", crossings)
+
+
+def combined_surveys(
+    files: Sequence[SurveyFile], crossings: Sequence[CrossingResult]
+) -> Combined | None:
+    """Return the last pause between surveys among the crossings of a state; None without one."""
+    times = sorted(crossing.entry_time for crossing in crossings)
+    pauses = [one for one in pairwise(times) if one[1] - one[0] >= PAUSE_DAYS * DAY_S]
+    if not pauses:
+        return None
+    earlier_s, later_s = pauses[-1]
+    earlier = [file for file in files if file.last_s <= earlier_s]
+    later = [file for file in files if file.first_s >= later_s]
+    command = None
+    if earlier and later and len(earlier) + len(later) == len(files):
+        baseline = max(earlier, key=lambda file: file.last_s)
+        names = [file.name for file in sorted(later, key=lambda file: file.first_s)]
+        command = shlex.join(["driveby", "report", *names, "--baseline", baseline.name])
+    return Combined(earlier_s, later_s, command)
+
+
+def days_between(earlier_s: float, later_s: float) -> int:
+    """Return the rounded number of days between two times in s."""
+    return round(abs(later_s - earlier_s) / DAY_S)
+
+
+def season_of(time_s: float, latitude_deg: float) -> str:
+    """Return the meteorological season of a time in s since 1970, by the hemisphere."""
+    quarter = datetime.fromtimestamp(time_s, UTC).month % 12 // 3
+    return _SEASONS[quarter if latitude_deg >= 0.0 else (quarter + 2) % 4]

@@ -1,0 +1,256 @@
+"""What limits a finding stands on the first page, by the rule that it names, and only where it
+holds.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib import rc_context
+
+from schemas.reasons import REASON_TEXTS, Reason
+from schemas.results import Results, results_json
+from schemas.site import Site
+from services.common.language import LANGUAGES, language_of
+from services.report.bridge import BridgeReport, bridge_reports
+from services.report.earlier import season_of
+from services.viewer.bridge_figure import draw_bridge
+from services.viewer.drawing import STYLE
+from tests.unit.report.test_report import KNOWN, Seen, fused, reported, site
+from tests.unit.viewer.found import RATIOS, results_of, some_crossing
+
+__all__ = ["site"]
+GAP, OUTAGE = Reason.GAP_ON_BRIDGE, Reason.POSITION_OUTAGE
+HALF_YEAR_S = 182.0 * 86400.0
+
+
+def report_on(site: Site, *results: Results, baseline: Path | None = None) -> BridgeReport:
+    files = [(Path(f"{n}.json"), one, site) for n, one in enumerate(results)]
+    (report,) = bridge_reports(files, baseline)
+    return report
+
+
+def first_page(found: Seen) -> str:
+    return found.text.partition("Evidence: all crossings")[0]
+
+
+@pytest.fixture
+def then(tmp_path: Path, site: Site) -> Path:
+    """A baseline of 21 September 2026 whose element 4 is weak already."""
+    path = tmp_path / "then.json"
+    path.write_text(results_json(fused(site, KNOWN)))
+    return path
+
+
+def changed(site: Site, factor: float, *, entry: float = 0.0) -> Results:
+    """A survey like the baseline but for element 2."""
+    ratios = RATIOS.copy()
+    ratios[1] *= factor
+    return results_of(site, some_crossing("z", entry=entry), used="z", ratios=ratios)
+
+
+def test_implausible_stiffness_takes_certainty_from_headline(site: Site) -> None:
+    ratios = RATIOS.copy()
+    ratios[4] = 2.21
+    stiff = results_of(site, some_crossing("a"), used="a", ratios=ratios)
+    found = report_on(site, stiff)
+    assert found.finding.headline == (
+        "One element appears less stiff. But element 5 appears stiffer than is physically "
+        "plausible."
+    )
+    text = first_page(reported(site, stiff))
+    assert "Not plausible: the 95 % interval of element 5 lies wholly more than 20 % above" in text
+    assert "take no value as certain, least of all those of elements 4 and 6" in text
+    assert "all checks passed; none explains the implausible stiffness" in text
+    assert "If the drawings show nothing stiffer at element 5, check mass" in text
+    assert re.search(r"17\.1–21\.4 .{,60} not plausible", text)
+    usual = first_page(reported(site, results_of(site, some_crossing("a"), used="a")))
+    assert "One element is clearly less stiff." in usual
+    assert "plausible" not in usual
+
+
+def test_implausible_stiffness_alone_is_never_reassuring(site: Site) -> None:
+    ratios = np.ones(7)
+    ratios[6] = 1.5
+    stiff = results_of(site, some_crossing("a"), used="a", ratios=ratios)
+    found = report_on(site, stiff)
+    assert found.finding.kind == "open"
+    text = first_page(reported(site, stiff))
+    assert "No element is clearly less stiff. But element 7 appears stiffer" in text
+    assert "least of all those of element 6." in text
+    assert "no additional inspection" not in text
+    assert "If the drawings show nothing stiffer at element 7" in text
+
+
+def test_gain_against_a_baseline_is_implausible_without_repair(site: Site, then: Path) -> None:
+    text = first_page(reported(site, changed(site, 1.5), baseline=then))
+    assert "But element 2 appears stiffer than is physically plausible." in text
+    assert "Without a repair no bridge gains that, not even by frost." in text
+    assert "plausible" not in first_page(reported(site, changed(site, 1.1), baseline=then))
+
+
+def test_interval_without_zero_is_possibly_less_stiff(site: Site, then: Path) -> None:
+    """The words follow the rule: clearly is beyond 10 %, possibly beyond 0."""
+    for factor, words in ((0.7, "clearly"), (0.88, "possibly"), (0.97, "neither")):
+        now = changed(site, factor)
+        (element,) = [
+            one
+            for one in report_on(site, now, baseline=then).view.comparison.elements  # type: ignore[union-attr]
+            if one.number == 2
+        ]
+        assert (element.high < 0.9) == (words == "clearly")
+        assert (element.high < 1.0) == (words != "neither")
+        text = first_page(reported(site, now, baseline=then))
+        assert "means that the whole 95 % interval lies more than 10 % below the baseline." in text
+        assert ("One element is clearly less stiff." in text) == (words == "clearly")
+        assert ("Possibly less stiff: element 2 (−12 %, 95 % in" in text) == (words == "possibly")
+        assert ("At the next inspection begin with element 2" in text) == (words == "possibly")
+        assert ("6 possibly less stiff" in text) is False
+        assert len(re.findall("possibly less stiff", text)) == (2 if words == "possibly" else 0)
+
+
+def test_element_weak_in_the_baseline_is_named(site: Site, then: Path) -> None:
+    text = first_page(reported(site, changed(site, 0.7), baseline=then))
+    assert re.search(
+        r"Element 4 \(60 %, 95 % interval \d\d to \d\d %\) was clearly less stiff", text
+    )
+    assert "If element 4 has not been inspected since the baseline, have it inspected, too." in text
+    assert re.search(r"12\.9–17\.1 .{,60} less stiff before", text)
+    alone = first_page(reported(site, changed(site, 0.7)))
+    assert "baseline already" not in alone
+    assert "less stiff before" not in alone
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        (0.0, None),
+        (20.0 * 86400.0, None),
+        (HALF_YEAR_S, "The surveys are 182 days apart, in autumn and in spring. Temp"),
+        (2.0 * HALF_YEAR_S, "The surveys are 364 days apart, both in autumn. Temperatures are not"),
+    ],
+)
+def test_seasons_of_compared_surveys_are_named(
+    site: Site, then: Path, entry: float, words: str | None
+) -> None:
+    text = first_page(reported(site, changed(site, 0.7, entry=entry), baseline=then))
+    if words is None:
+        assert "days apart" not in text
+    else:
+        assert words in text
+        assert (
+            "a difference of 20 K alone changes the stiffness of concrete and asphalt by some 8 %"
+            in text
+        )
+
+
+def test_seasons_are_those_of_the_hemisphere() -> None:
+    january, july = 1.7678e9, 1.7834e9
+    assert [season_of(one, 48.0) for one in (january, july)] == ["winter", "summer"]
+    assert [season_of(one, -34.0) for one in (january, july)] == ["summer", "winter"]
+
+
+def surveys(site: Site, pause_s: float) -> list[Results]:
+    """Two good surveys by files, of a method whose crossings are fused."""
+    first = fused(site, KNOWN)
+    names = {"a": "x", "b": "y", "c": "z"}
+    crossings = tuple(
+        one.model_copy(
+            update={
+                "crossing_id": names[one.crossing_id],
+                "entry_time": one.entry_time + pause_s,
+                "exit_time": one.exit_time + pause_s,
+            }
+        )
+        for one in first.crossings
+    )
+    state = first.bridges["bridge-1"].model_copy(update={"crossings_used": tuple("abcxyz")})
+    second = first.model_copy(
+        update={
+            "crossings": crossings,
+            "created": first.created + pause_s,
+            "bridges": {"bridge-1": state},
+        }
+    )
+    return [first, second]
+
+
+def test_combined_surveys_are_announced_with_the_command(site: Site, then: Path) -> None:
+    first, second = surveys(site, HALF_YEAR_S)
+    text = first_page(reported(site, first, second))
+    assert "Surveys that are 182 days apart (2026-09-21 and 2027-03-22) are combined" in text
+    assert "To see the change: driveby report 1.json --baseline 0.json" in text
+    together = second.model_copy(update={"crossings": first.crossings + second.crossings})
+    text = first_page(reported(site, together))
+    assert "identify each into a results file of its own, then run driveby report LATER" in text
+    assert "combined" not in first_page(reported(site, *surveys(site, 3.0 * 86400.0)))
+    assert "are combined" not in first_page(reported(site, first, second, baseline=then))
+
+
+def with_ends(results: Results, sprung: float, giving: float) -> Results:
+    content = results.model_dump(mode="json")
+    for one in content["crossings"]:
+        one["derived"]["probability_sprung"] = {"start": sprung, "end": 0.1}
+        one["derived"]["probability_giving"] = {"start": 0.1, "end": giving}
+    return Results.model_validate(content)
+
+
+def test_likely_restraint_is_on_the_first_page_unless_declared(site: Site) -> None:
+    plain = fused(site, KNOWN)
+    text = first_page(reported(site, with_ends(plain, 0.998, 0.95)))
+    assert "integral abutment: the south-west end (probability 99 %)." in text
+    assert "loose bearing: the north-east end (probability 95 %)." in text
+    unlikely = first_page(reported(site, with_ends(plain, 0.8, 0.8)))
+    assert "Restrained against rotation" not in unlikely
+    assert "Yielding" not in unlikely
+    bridge = site.bridges[0].model_copy(update={"bearings": ("sprung", "unknown")})
+    declared = site.model_copy(update={"bridges": (bridge,)})
+    text = first_page(reported(declared, with_ends(plain, 0.998, 0.95)))
+    assert "Restrained against rotation" not in text
+    assert "Yielding vertically" in text
+
+
+def test_excluded_crossings_have_number_and_reason(site: Site) -> None:
+    content = fused(site, KNOWN).model_dump(mode="json")
+    bad = [
+        some_crossing("r", verdict="rejected", reasons=("gap_on_bridge",), entry=300.0),
+        some_crossing("s", verdict="suspect", reasons=("position_outage",), entry=400.0),
+        some_crossing("t", verdict="suspect", reasons=("position_outage",), entry=500.0),
+    ]
+    content["crossings"] += results_of(site, *bad).model_dump(mode="json")["crossings"]
+    content["bridges"]["bridge-1"]["crossings_left_out"] = [
+        {"crossing_id": name, "reason": "suspect"} for name in "st"
+    ]
+    text = first_page(reported(site, Results.model_validate(content)))
+    assert "6 crossings: 3 good, 2 suspect, 1 rejected. The numbers below combine 3" in text
+    why = [REASON_TEXTS[code].removesuffix(".") for code in (GAP, OUTAGE)]
+    assert f"Excluded: 1 rejected ({why[0]}); 2 suspect ({why[1]})." in text
+    assert "Excluded" not in first_page(reported(site, fused(site, KNOWN)))
+
+
+def test_glossary_ignores_names_within_the_markup(site: Site) -> None:
+    """An attribute of the sketch is `dominant-baseline`."""
+    rejected = some_crossing("a", verdict="rejected", reasons=("speed_too_low",))
+    words = reported(site, results_of(site, rejected)).text.rpartition(" Words ")[2]
+    assert "Verdict:" in words
+    assert "Baseline:" not in words
+
+
+@pytest.mark.parametrize("code", LANGUAGES)
+def test_figure_has_numbers_of_one_meaning(site: Site, then: Path, code: str) -> None:
+    language = language_of(code)
+    loss = language.text("figure.less", loss=30.0, doubt="").partition(" % ")[2]
+    for baseline, meaning in ((None, "ratio"), (then, "change")):
+        files = [(Path("now.json"), changed(site, 0.7), site)]
+        (report,) = bridge_reports(files, baseline, language=language)
+        with rc_context(STYLE):
+            figure = draw_bridge(report.view, with_heading=False, language=language)
+        panel = figure.axes[0]
+        bold = [one.get_text() for one in panel.texts if one.get_fontweight() == "bold"]
+        numbers = [text for text in bold if not text.endswith(loss)]
+        assert len(numbers) == 7
+        assert {"%" in text for text in numbers} == {meaning == "change"}
+        assert language.text(f"figure.numbers_{meaning}") in panel.get_title(loc="left")
+        labels = [one.get_ylabel() for one in figure.axes]
+        assert (language.text("figure.ratio") in labels) == (meaning == "ratio")
