@@ -65,7 +65,7 @@ class CoupledResponse(NamedTuple):
 def constant_speed(start_m: float, speed_m_per_s: float, steps: int, step_s: float) -> Motion:
     """Return the motion from x_1 = start at a constant (signed) speed."""
     position = start_m + speed_m_per_s * step_s * np.arange(steps, dtype=np.float64)
-    return Motion(position, np.full(steps, speed_m_per_s), np.zeros(steps))
+    return Motion(position, np.full(steps, float(speed_m_per_s)), np.zeros(steps))
 
 
 def constant_acceleration(
@@ -153,17 +153,21 @@ def _truck_matrices(car: _vehicle.HalfCar, step_s: float, gravity_m_per_s2: floa
     effective = mass + 0.5 * step_s * damping + 0.25 * step_s**2 * stiffness
     static_load = _vehicle.static_axle_loads_n(car, gravity_m_per_s2)
     front, rear = (
-        WheelForces(
-            float(stiffness[w, w]),
-            static_load[w] - gravity_m_per_s2 * car.unsprung_mass_kg[w],
-            car.bilinear_damping * car.suspension_damping_ns_per_m[w],
-            car.air_spring_exponent,
-            car.dry_friction_n[w],
-            car.friction_length_m,
-            car.friction_load_growth,
-            car.tyre_stiffness_n_per_m[w],
-            car.tyre_damping_ns_per_m[w],
-            static_load[w],
+        # numba would compile the march again for a whole number among them.
+        WheelForces._make(
+            float(constant)
+            for constant in (
+                stiffness[w, w],
+                static_load[w] - gravity_m_per_s2 * car.unsprung_mass_kg[w],
+                car.bilinear_damping * car.suspension_damping_ns_per_m[w],
+                car.air_spring_exponent,
+                car.dry_friction_n[w],
+                car.friction_length_m,
+                car.friction_load_growth,
+                car.tyre_stiffness_n_per_m[w],
+                car.tyre_damping_ns_per_m[w],
+                static_load[w],
+            )
         )
         for w in range(2)
     )

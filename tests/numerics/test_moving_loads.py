@@ -18,6 +18,7 @@ from pre_core.physics.bridge import (
     natural_frequencies_hz,
     uniform_beam,
 )
+from pre_core.physics.march import march
 from pre_core.physics.newmark import newmark_modal
 from pre_core.physics.simulate import WheelRoad, constant_speed, deflection_m, simulate
 from pre_core.physics.vehicle import HalfCar
@@ -56,6 +57,14 @@ def midspan_of_sprung_mass(
     run = simulate(car, beam, motion, smooth, step_s, gravity_m_per_s2=g)
     assert run.converged
     return deflection_m(beam, run, np.array([0.5 * span]))[:, 0]
+
+
+def test_whole_numbers_compile_no_further_kernel() -> None:
+    beam = uniform_beam(10.0, [1e9] * 2, 1000.0, 0.0, 0.0)
+    midspan_of_sprung_mass(one_axle(1e3, 1e2, 1e5, 1e6), beam, 10.0, 9.81, 0.01)
+    compiled = list(march.signatures)
+    midspan_of_sprung_mass(one_axle(1000, 100, 100_000, 1_000_000), beam, 10, 10, 0.01)
+    assert march.signatures == compiled
 
 
 @pytest.mark.parametrize("sprung_by", ["suspension", "tyre"])
