@@ -260,11 +260,10 @@ def nearest_m(latitude: Floats, longitude: Floats, bridges: Iterable[Bridge]) ->
         return np.inf
     places = np.radians([(b.start_latitude_deg, b.start_longitude_deg) for b in bridges])
     every = max(1, latitude.size // 200)
-    best = np.inf
-    for phi, lam in np.radians(np.column_stack([latitude, longitude])[::every]):
-        a = (
-            np.sin(0.5 * (places[:, 0] - phi)) ** 2
-            + np.cos(phi) * np.cos(places[:, 0]) * np.sin(0.5 * (places[:, 1] - lam)) ** 2
-        )
-        best = min(best, float(2.0 * SEMI_MAJOR_AXIS_M * np.arcsin(np.sqrt(min(1.0, a.min())))))
-    return best
+    phi, lam = np.radians(np.column_stack([latitude, longitude])[::every]).T[:, :, None]
+    a = (
+        np.sin(0.5 * (places[:, 0] - phi)) ** 2
+        + np.cos(phi) * np.cos(places[:, 0]) * np.sin(0.5 * (places[:, 1] - lam)) ** 2
+    )
+    nearest = np.fmin.reduce(a, axis=None, initial=1.0)  # a fix may be NaN
+    return float(2.0 * SEMI_MAJOR_AXIS_M * np.arcsin(np.sqrt(nearest)))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -61,16 +62,22 @@ def measured() -> tuple[Columns, Columns]:
 ACCEL, GPS = measured()
 
 
-def cell(value: object, decimal: str) -> str:
-    if isinstance(value, str):
-        return value
-    number = float(value)  # type: ignore[arg-type]
-    return "" if np.isnan(number) else repr(number).replace(".", decimal)
+@lru_cache(maxsize=50)
+def numbers(column: bytes, decimal: str) -> list[str]:
+    """Return the cells of a column of doubles; most tables share most of their columns."""
+    values = np.frombuffer(column).tolist()
+    return ["" if v != v else repr(v).replace(".", decimal) for v in values]
+
+
+def cells(column: Any, decimal: str) -> list[str]:
+    if len(column) and isinstance(column[0], str):
+        return list(column)
+    return numbers(np.asarray(column, dtype=np.float64).tobytes(), decimal)
 
 
 def table(columns: dict[str, Any], delimiter: str = ",", decimal: str = ".", **more: Any) -> str:
-    rows = zip(*columns.values(), strict=True)
-    lines = [delimiter.join(cell(v, decimal) for v in row) for row in rows]
+    rows = zip(*(cells(column, decimal) for column in columns.values()), strict=True)
+    lines = [delimiter.join(row) for row in rows]
     head = [] if more.get("header") is False else [delimiter.join(columns)]
     return "\n".join([*more.get("before", []), *head, *more.get("units", []), *lines]) + "\n"
 
