@@ -141,7 +141,6 @@ def sprung_mass_in_sine_modes(case: dict[str, Any], times: FloatArray) -> FloatA
     return np.array(result)
 
 
-@pytest.mark.slow
 def test_moving_sprung_mass_against_an_independent_solution(
     known_answers: dict[str, Any], agree: Agree
 ) -> None:
