@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -311,16 +312,12 @@ def test_a_full_disk_on_the_truck_stops_nothing(
 
 def answering(client: zenoh.Session, answer: Callable[[zenoh.Query], None]) -> Callable[[], None]:
     """A truck that answers every question as it likes; return what ends it."""
-    queryable = client.declare_queryable(
-        wire.spool_selector("live", "truck-1"), zenoh.handlers.FifoChannel(100)
-    )
+    # Not a channel of Zenoh: one cannot be undeclared while a thread waits for it.
+    queries: SimpleQueue[zenoh.Query | None] = SimpleQueue()
+    queryable = client.declare_queryable(wire.spool_selector("live", "truck-1"), queries.put)
 
     def run() -> None:
-        while True:
-            try:
-                query = queryable.handler.recv()
-            except zenoh.ZError:  # undeclared
-                return
+        while (query := queries.get()) is not None:
             with query, contextlib.suppress(zenoh.ZError):
                 answer(query)
 
@@ -329,6 +326,7 @@ def answering(client: zenoh.Session, answer: Callable[[zenoh.Query], None]) -> C
 
     def end() -> None:
         queryable.undeclare()
+        queries.put(None)
         thread.join()
 
     return end
@@ -428,19 +426,21 @@ def test_a_page_without_end_is_given_up(
         1, [SpoolBoot(1, 10, [(0, 9)], -1, 0), SpoolBoot(2, 1, [], 0, 0)]
     )
     sent: list[int] = []
+    is_given_up = threading.Event()
 
     def answer(query: zenoh.Query) -> None:
         if not dict(query.parameters):
             query.reply(wire.spool_key(ACCEL), contents)
             return
         sent.append(0)
-        while sent[-1] < 20_000:
+        while sent[-1] < 20_000 and not is_given_up.is_set():
             query.reply(wire.spool_key(ACCEL), bytes(size), attachment=encode_identity(1, 100))
             sent[-1] += 1
 
     end = answering(client, answer)
     logger = Logger(router)
     logger.run(lambda: any("a page without end" in r.getMessage() for r in caplog.records))
+    is_given_up.set()
     assert logger.received == []
     [truck] = logger.recovery._trucks.values()
     assert truck.task is None
