@@ -114,8 +114,13 @@ def terminate() -> End:
     return end
 
 
-def drive(batches: int = 200, vehicle: str = "truck-1", boot_id: int = 77) -> Iterator[Message]:
-    """A truck with every vehicle stream: 50 ms batches of four channels, a fix every 100 ms."""
+def drive(
+    batches: int = 200, vehicle: str = "truck-1", boot_id: int = 77, large_from: int | None = None
+) -> Iterator[Message]:
+    """A truck with every vehicle stream: 50 ms batches of four channels, a fix every 100 ms.
+
+    From batch `large_from` on at 50 kHz instead of 1 kHz: 80 KB each.
+    """
     rng = np.random.default_rng(1)
     start_ns = 1_700_000_000_000_000_000
 
@@ -128,7 +133,10 @@ def drive(batches: int = 200, vehicle: str = "truck-1", boot_id: int = 77) -> It
     for number in range(batches):
         device_ns = 5 + number * 50_000_000
         time_ns = start_ns + number * 50_000_000
-        channels = {name: AccelChannel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
+        count = 50 if large_from is None or number < large_from else 2500
+        channels = {
+            name: AccelChannel(20.0 * count, rng.standard_normal(count)) for name in CHANNELS
+        }
         batch = AccelBatch(boot_id, number, device_ns, time_ns, channels)
         yield message("accel", encode_accel(batch), number, time_ns)
         if number % 2 == 0:

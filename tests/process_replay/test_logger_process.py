@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -16,11 +17,12 @@ import zenoh
 from schemas.events import EventKind, decode_event
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import GnssFix, encode_gnss, encode_identity
-from schemas.topics import selector
+from schemas.topics import Message, selector
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
 from services.bus.subscription import RawSample, Subscription, get_latest
 from services.recordings.recording import read_info, read_messages
+from services.recordings.writer import write_recording
 from tests.process_replay.starting import End, Start, start_logger
 from tests.waiting import LONGEST_S, until
 
@@ -174,11 +176,19 @@ def test_an_existing_file_is_left_alone(
 
 
 def test_full_disk_is_reported_and_ends_the_logger(
-    start: Start, endpoint: str, recording: Path, tmp_path: Path
+    start: Start,
+    endpoint: str,
+    drive_messages: Callable[..., Iterator[Message]],
+    tmp_path: Path,
 ) -> None:
-    """A limit on the size of files stands for the full disk: writing fails in the same way."""
+    """A limit on the size of files stands for the full disk: writing fails in the same way.
+
+    It is the first large batch that exceeds the limit, so END has room wherever chunks end.
+    """
     import resource
 
+    recording = tmp_path / "drive.mcap"
+    write_recording(recording, drive_messages(large_from=15), site_toml=None, reason="test")
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limit[1]))  # the child inherits it
     try:
