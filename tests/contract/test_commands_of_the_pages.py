@@ -45,7 +45,6 @@ NOT_RUN = {
     "driveby identify s3://bucket/fleet --into identified": (
         "tests/unit/cli/test_cluster.py has a store"
     ),
-    'pip install "driveby[history,s3]"': NETWORK,
     'pip install --upgrade "WHEEL[all]"': NETWORK,
     'pytest tests/verdicts/test_faults.py -m slow -k "5 and t] or span"': LONG,
     "pip uninstall driveby": "removes what this test runs in",
@@ -113,7 +112,6 @@ NOT_RUN = {
     "make containers": ITSELF,
     "make docs": "needs a network the first time; tests/contract/test_site.py builds the site",
     'pip install "WHEEL[identify,view,notebook]"': NETWORK,
-    'pip install "driveby[notebook]"': NETWORK,
     "pip install WHEEL": NETWORK,
     'pip install "WHEEL[identify,view]"': NETWORK,
     'pip install "WHEEL[all]"': NETWORK,
@@ -138,7 +136,6 @@ NOT_RUN = {
         "needs a recording of ROS 2; tests/unit/drives/test_ros2_recording.py writes some"
     ),
     "python -m tests.benchmarks.ros2_rate": "measures; its figure is of one machine",
-    'pip install "driveby[ros2]"': NETWORK,
     "driveby truck FOLDER --site site.toml --spool spool/truck-1": SERVICE,
     "python docs/examples/decode_estimate.py recordings/replay-drive/results-TIME.mcap": (
         "its file has another name each time; tests/contract/test_site.py runs the example"
