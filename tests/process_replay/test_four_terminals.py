@@ -69,7 +69,7 @@ def test_what_the_readme_says_happens(endpoint: str, project: Path, tmp_path: Pa
             if name in ("logger", "worker"):
                 until(partial(is_ready, name), f"the {name}")
         assert started["truck"].wait(timeout=LONGEST_S) == 0, seen("truck")
-        lowest = r"good, lowest EI_4 0\.4\d\d of nominal \(0\.3\d\d to 0\.4\d\d\)\n"
+        lowest = r"good, lowest EI_4 0\.4\d\d of nominal \(95 %: 0\.3\d\d to 0\.4\d\d\)\n"
         until(lambda: re.search(rf"truck-1 → bridge-1: {lowest}", seen("watch")), "the result")
         for state in ("truck-1 drives", "on the bridge", "complete", "identifying"):
             assert state in seen("watch")
