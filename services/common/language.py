@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import string
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from functools import lru_cache
 from importlib import resources
 from typing import Any, Final, NamedTuple
@@ -128,6 +129,11 @@ def language_of(code: str) -> Language:
             for one in content["glossary"]
         ),
     )
+
+
+def utc_day(time_s: float) -> str:
+    """Return the day of a time in s since 1970 UTC, such as 2026-07-01, alike in all languages."""
+    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"
 
 
 def _flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from datetime import UTC, datetime
 
 from schemas.results import CrossingResult
-from services.common.language import Language
+from services.common.language import Language, utc_day
 from services.report.bridge import BridgeReport
 from services.report.cautions import named_elements, possibly_weak, weak_before
 from services.report.place import position_of
@@ -114,7 +113,7 @@ def _stiffer(report: BridgeReport, language: Language) -> Iterator[str]:
 def _drive_again(report: BridgeReport, language: Language) -> Iterator[str]:
     """Yield how another crossing would add information."""
     used = report.used
-    days = {f"{datetime.fromtimestamp(one.entry_time, UTC):%Y-%m-%d}" for one in used}
+    days = {utc_day(one.entry_time) for one in used}
     once = [
         language.text(f"advice.{key}")
         for key, values in (

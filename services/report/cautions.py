@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from datetime import UTC, datetime
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from pre_core.constants import SLOPE_SPREAD
 from schemas.results import CrossingResult
 from schemas.site import Bridge
-from services.common.language import Language
+from services.common.language import Language, utc_day
 from services.identification.comparison import (
     CLEAR_LOSS,
     IMPLAUSIBLE_GAIN,
@@ -161,8 +160,8 @@ def _combined(combined: Combined | None, language: Language) -> Iterator[str]:
     yield language.text(
         "caution.combined",
         days=days_between(combined.earlier_s, combined.later_s),
-        earlier=_day(combined.earlier_s),
-        later=_day(combined.later_s),
+        earlier=utc_day(combined.earlier_s),
+        later=utc_day(combined.later_s),
         how=how,
     )
 
@@ -190,7 +189,3 @@ def _ends(measured: Measured, language: Language) -> Iterator[str]:
         ]
         if ends:
             yield language.text(f"caution.{name}", ends=language.listed(ends))
-
-
-def _day(seconds: float) -> str:
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d}"

@@ -1,13 +1,12 @@
 """The section on a bridge's history: its periods next to each other."""
 
 from collections.abc import Iterator
-from datetime import UTC, datetime
 
 import matplotlib
 import numpy as np
 
 from schemas.alarms import Alarm
-from services.common.language import ENGLISH, Language
+from services.common.language import ENGLISH, Language, utc_day
 from services.history.bridge_history import BridgeHistory, statements
 from services.report.html import Html, inlined_svg, table, tag
 from services.viewer.drawing import STYLE, figure_bytes
@@ -34,8 +33,8 @@ def history_section(past: BridgeHistory, prefix: str, language: Language = ENGLI
     wording = language.text(
         "history.from_to",
         how_much=_how_much(past, language),
-        first=_day(past.periods[0].begin_s),
-        last=_day(past.periods[-1].end_s),
+        first=utc_day(past.periods[0].begin_s),
+        last=utc_day(past.periods[-1].end_s),
     )
     label = language.text("history.figure", summary=wording)
     how = language.text("history.how", unit=language.text(past.unit))
@@ -64,11 +63,11 @@ def _alarms(past: BridgeHistory, language: Language) -> Iterator[Html]:
         note = alarm.acknowledged
         state = language.text("history.stands")
         if note is not None:
-            values = {"by": note.by, "day": _day(note.time), "note": note.note}
+            values = {"by": note.by, "day": utc_day(note.time), "note": note.note}
             which = "acknowledged_note" if note.note else "acknowledged"
             state = language.text(f"history.{which}", **values)
         sentence = alarm_sentence(alarm, language)
-        raised = _day(alarm.raised)
+        raised = utc_day(alarm.raised)
         line = language.text("history.alarm", day=raised, alarm=sentence, state=state)
         lines.append(tag("li", line))
     if lines:
@@ -86,7 +85,7 @@ def alarm_sentence(alarm: Alarm, language: Language) -> str:
         f"history.{alarm.direction}",
         element=alarm.element,
         change=100.0 * abs(1.0 - alarm.ratio),
-        since=_day(alarm.since),
+        since=utc_day(alarm.since),
         low=ends[0],
         high=ends[1],
     )
@@ -115,7 +114,3 @@ def _elements(drawn: HistoryView, language: Language) -> Html:
             ]
         )
     return table(heads, rows)
-
-
-def _day(time_s: float) -> str:
-    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"

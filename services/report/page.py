@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from datetime import UTC, datetime
+from collections.abc import Callable, Collection, Iterator, Sequence
 
 import matplotlib
 
 from schemas.results import CrossingResult
-from services.common.language import ENGLISH, Language
+from services.common.language import ENGLISH, Language, utc_day
 from services.common.progress import Steps, no_step_progress
 from services.identification.comparison import Element
 from services.report.advice import next_steps
@@ -166,7 +165,7 @@ def _facts(report: BridgeReport, language: Language) -> Html:
 
 def _dates(crossings: Sequence[CrossingResult]) -> dict[str, str]:
     """Return the first day, the last one if it is another, and the trucks."""
-    first, last = _day(crossings[0].entry_time), _day(crossings[-1].entry_time)
+    first, last = utc_day(crossings[0].entry_time), utc_day(crossings[-1].entry_time)
     trucks = ", ".join(sorted({crossing.vehicle for crossing in crossings}))
     return {"first": first, "trucks": trucks} | ({} if first == last else {"last": last})
 
@@ -217,10 +216,11 @@ def _elements(report: BridgeReport, language: Language) -> Html:
         keys = ["element", "place", "before", "after", "change", "remark"]
     rows, classes = [], []
     compared = view.comparison.elements if view.comparison is not None else ()
+    earlier = {element.number for element in weak_before(view, before)}
     for n, mean in enumerate(view.estimate.mean):
         low, high = view.estimate.low[n] / 1e9, view.estimate.high[n] / 1e9
         element = compared[n] if compared else None
-        remark = _remark(n + 1, report)
+        remark = _remark(n + 1, element, view.unresolved, earlier)
         ratio = language.number(mean / view.nominal_nm2[n], ".3f")
         change = "" if element is None else _change(element, language)
         ends = {"from_m": view.edges_m[n], "to_m": view.edges_m[n + 1]}
@@ -232,26 +232,31 @@ def _elements(report: BridgeReport, language: Language) -> Html:
             old = (before.estimate.mean[n], before.estimate.low[n], before.estimate.high[n])
             row += [_value(*old, language), _value(mean, 1e9 * low, 1e9 * high, language)]
             row.append(change)
-        doubt = (
-            "?" if remark in ("weak", "stiff", "implausible", "lower") and view.is_doubtful else ""
-        )
+        doubt = "?" if remark in _DOUBTFUL and view.is_doubtful else ""
         row.append(language.text(f"remark.{remark}") + doubt if remark else "")
         rows.append(row)
         classes.append(remark if remark == "weak" and not view.is_doubtful else "")
     return table([language.text(f"table.{key}") for key in keys], rows, classes)
 
 
-def _remark(number: int, report: BridgeReport) -> str:
-    """Return the key of the remark on an element; empty for none."""
-    comparison = report.view.comparison
-    element = None if comparison is None else comparison.elements[number - 1]
+def _remark(
+    number: int,
+    element: Element | None,
+    unresolved: Collection[int],
+    earlier: Collection[int],
+) -> str:
+    """Return the key of the remark on an element; empty for none.
+
+    `element` is its comparison, if there is one; `unresolved` and `earlier` are the numbers of
+    unresolved elements and of those that were weak in the baseline.
+    """
     if element is not None and element.is_weak:
         return "weak"
     if element is not None and element.is_stiff:
         return "implausible" if element.is_implausible else "stiff"
-    if number in report.view.unresolved:
+    if number in unresolved:
         return "unresolved"
-    if number in {one.number for one in weak_before(report.view, report.before)}:
+    if number in earlier:
         return "earlier"
     return "lower" if element is not None and element.is_lower else ""
 
@@ -281,7 +286,3 @@ def _caveats(report: BridgeReport, language: Language) -> Iterator[Html]:
 def _name(report: BridgeReport) -> str:
     bridge = report.bridge
     return bridge.id if bridge.owner_id is None else f"{bridge.owner_id} ({bridge.id})"
-
-
-def _day(seconds: float) -> str:
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d}"

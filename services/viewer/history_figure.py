@@ -17,7 +17,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from services.common.language import ENGLISH, Language
+from services.common.language import ENGLISH, Language, utc_day
 from services.history.bridge_history import BridgeHistory, Statement, statements
 from services.viewer.crossing_view import VERDICT_COLOURS
 from services.viewer.drawing import (
@@ -115,7 +115,7 @@ def history_view(past: BridgeHistory) -> HistoryView:
             alarm.raised,
             alarm.sentence(),
             "" if alarm.acknowledged is None else
-            f"{alarm.acknowledged.by}, {_day(alarm.acknowledged.time)}",
+            f"{alarm.acknowledged.by}, {utc_day(alarm.acknowledged.time)}",
             "" if alarm.acknowledged is None else alarm.acknowledged.note,
         )
         for alarm in past.alarms
@@ -305,10 +305,6 @@ def _over_time(axes: Axes, language: Language) -> None:
     axes.xaxis.set_major_formatter(_LocalisedDates(locator, language))
     for side in ("top", "left", "right"):
         axes.spines[side].set_visible(False)
-
-
-def _day(time_s: float) -> str:
-    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"
 
 
 def _dates(times_s: Iterable[float]) -> list[float]:

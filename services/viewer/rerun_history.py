@@ -2,7 +2,6 @@
 
 import io
 import tempfile
-from datetime import UTC, datetime
 from pathlib import Path
 
 import matplotlib
@@ -13,6 +12,7 @@ from matplotlib.image import imread
 from numpy.typing import NDArray
 
 from services.common.files import replaced_atomically
+from services.common.language import utc_day
 from services.history.bridge_history import BridgeHistory
 from services.viewer.drawing import STYLE, figure_bytes
 from services.viewer.history_figure import HistoryView, draw_history, history_view
@@ -90,8 +90,7 @@ def _history_text(history: HistoryView) -> str:
     lines = [f"# {history.bridge}", ""]
     for mark in history.marks:
         state = f"noted by {mark.acknowledged}" if mark.acknowledged else "active"
-        lines.append(f"- Alarm of {datetime.fromtimestamp(mark.raised_s, UTC):%Y-%m-%d}, {state}: "
-                     f"{mark.sentence}")  # fmt: skip
+        lines.append(f"- Alarm of {utc_day(mark.raised_s)}, {state}: {mark.sentence}")
     for wording in history.statements:
         lines += ["", wording.text]
     return "\n".join(lines) + "\n"
