@@ -23,6 +23,8 @@ from pre_core.crossing.posterior import (
     PosteriorProblem,
     layout,
     log_odds_of_absence,
+    posterior_covariance,
+    precision_root,
     rigidity_spread,
 )
 from pre_core.crossing.preparation import mismatch_gradient
@@ -109,6 +111,20 @@ def to_compliance_coordinates(
     centre[elements] = np.exp(-sigma * y[elements])
     changed[:, elements] /= -sigma * centre[elements]
     return centre, changed
+
+
+class ComplianceNormal(NamedTuple):
+    """Gauss-Newton approximation of a posterior, with c in place of the elements' coordinates."""
+
+    centre: FloatArray  # (f,)
+    jacobian: FloatArray  # (m, f)
+    covariance: FloatArray  # (f, f)
+
+
+def compliance_normal(found: Optimum) -> ComplianceNormal:
+    """Return the approximation at an optimum."""
+    centre, jacobian = to_compliance_coordinates(found.problem, found.state.y, found.state.jacobian)
+    return ComplianceNormal(centre, jacobian, posterior_covariance(precision_root(jacobian)))
 
 
 def marginal(

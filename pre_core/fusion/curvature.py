@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from pre_core.crossing import posterior
-from pre_core.crossing.compliances import to_compliance_coordinates
-from pre_core.crossing.fit import Optimum, normal_approximation
+from pre_core.crossing.compliances import compliance_normal
+from pre_core.crossing.fit import Optimum
 
 FloatArray = NDArray[np.float64]
 
@@ -60,18 +60,13 @@ def curvature_terms(
     of the trajectory's coefficient `place`. All other coordinates follow the moves as their
     conditional means do.
     """
-    y = found.state.y
     where = posterior.layout(problem)
-    sigma = posterior.rigidity_spread(problem.priors)
-    centre, _ = to_compliance_coordinates(problem, y, np.zeros((1, y.size)))
-    _, covariance = normal_approximation(found)
-    unit = np.ones(y.size)
-    unit[where.elements] = -sigma * centre[where.elements]
-    covariance = unit[:, None] * covariance * unit
+    centre, _, covariance = compliance_normal(found)
     kept = np.append(where.bridge, place)
     ends = np.flatnonzero(np.isin(kept, where.half_normal))
-    directions = _directions(covariance[np.ix_(kept, kept)], centre[where.bridge], sigma.size, ends)
-    full = covariance[:, kept] @ np.linalg.solve(covariance[np.ix_(kept, kept)], directions)
+    of_kept = covariance[np.ix_(kept, kept)]
+    directions = _directions(of_kept, centre[where.bridge], where.elements.size, ends)
+    full = covariance[:, kept] @ np.linalg.solve(of_kept, directions)
     differences = _second_differences(problem, centre, full, ends, rows)
     weight, shapes = np.linalg.eigh(differences @ differences.T)
     clear = np.flatnonzero(weight > _PLAIN**2)[::-1][:_MAX_BENDS]

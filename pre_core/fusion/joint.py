@@ -68,16 +68,6 @@ class FusedDraws(NamedTuple):
     tracks: tuple[SharedMismatch, ...]
 
 
-def fuse(parts: Sequence[FusionInput], priors: BridgePriors, count: int, seed: int) -> FusedDraws:
-    """Return draws of a bridge, `count` of each chain, from crossings in coordinates of `priors`.
-
-    The order of the parts does not matter. Raise ValueError without parts.
-    """
-    if not parts:
-        raise ValueError("no crossings to fuse")
-    return sample_joint(build_joint(parts, priors), priors, count, seed)
-
-
 def sample_joint(
     information: JointInformation,
     priors: BridgePriors,
@@ -86,7 +76,7 @@ def sample_joint(
     report: Report = lambda stage, fraction: None,
     threads: int = 1,
 ) -> FusedDraws:
-    """Return draws as `fuse` does; they do not depend on the number of threads."""
+    """Return draws of a bridge, `count` of each chain; they do not depend on `threads`."""
     between = variability_posterior(information, priors)
     drawn = _draw_bridge(information, priors, between, count, seed, report, threads)
     return FusedDraws(*drawn, is_consistent_with_zero(between), information.shared)

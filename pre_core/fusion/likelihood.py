@@ -133,7 +133,10 @@ def covariance_of_coefficients(
 
 
 def likelihood(found: Optimum, *, with_bends: bool = True) -> CrossingLikelihood:
-    """Return the likelihood at an optimum, optionally without curvature terms and offset."""
+    """Return the likelihood at an optimum.
+
+    Without `with_bends` it has no curvature terms, offset and response to short waves.
+    """
     problem, y = found.problem, found.state.y
     where = posterior.layout(problem)
     state = found.state
@@ -187,7 +190,7 @@ def likelihood(found: Optimum, *, with_bends: bool = True) -> CrossingLikelihood
         found.problem.mismatch.level_m3 * long_wave_power(found.problem.mismatch),
         _off_bridge(found) if differs else None,
         bends,
-        _short_waves_of(found) if differs and with_bends else None,
+        _response_to_short_waves(found) if differs and with_bends else None,
     )
 
 
@@ -280,7 +283,7 @@ def integrate_errors(
     return precision - across @ solved[:, :-1], linear - across @ solved[:, -1], constant
 
 
-def _short_waves_of(found: Optimum) -> ShortWaveResponse:
+def _response_to_short_waves(found: Optimum) -> ShortWaveResponse:
     at = posterior.points(found.problem, found.state.y[None, :])
     return short_wave_response(found, _rear_m(found.problem.crossing, at))
 

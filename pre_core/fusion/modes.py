@@ -36,6 +36,17 @@ class Mode(NamedTuple):
     weight: float
 
 
+def fuse(parts: Sequence[FusionInput], priors: BridgePriors, count: int, seed: int) -> FusedDraws:
+    """Return draws of a bridge, `count` of each chain, from crossings in coordinates of `priors`.
+
+    The order of the parts does not matter. Raise ValueError without parts.
+    """
+    if not parts:
+        raise ValueError("no crossings to fuse")
+    modes = bridge_modes(parts, priors, build_joint(parts, priors))
+    return sample_modes(modes, priors, count, seed)
+
+
 def bridge_modes(
     parts: Sequence[FusionInput], priors: BridgePriors, first: JointInformation
 ) -> tuple[Mode, ...]:

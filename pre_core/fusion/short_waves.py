@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.crossing import posterior
-from pre_core.crossing.compliances import to_compliance_coordinates
+from pre_core.crossing.compliances import compliance_normal
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.rows import RESIDUALS, filter_adjoint
 from pre_core.crossing.whitening import project_out_noise, solve_transposed
@@ -46,10 +46,9 @@ class ShortWaveResponse(NamedTuple):
 
 def short_wave_response(found: Optimum, rear_m: FloatArray) -> ShortWaveResponse:
     """Return the response of an optimum; `rear_m` (rows,) is the rear axle's chainage."""
-    problem, state = found.problem, found.state
+    problem = found.problem
     where = posterior.layout(problem)
-    _, jacobian = to_compliance_coordinates(problem, state.y, state.jacobian)
-    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    _, jacobian, covariance = compliance_normal(found)
     data = problem.noise.reciprocal.size
     weights = project_out_noise(problem.noise, covariance[where.bridge] @ jacobian[:data].T)
     span_m = problem.crossing.span_m
