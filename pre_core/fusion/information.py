@@ -43,8 +43,6 @@ class CrossingInformation(NamedTuple):
     linear: FloatArray
     places: NDArray[np.int64]
     """Indices of its coordinates among all."""
-    constant: float = 0.0
-    """Constant of its log-likelihood."""
 
 
 class JointInformation(NamedTuple):

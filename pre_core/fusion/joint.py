@@ -25,7 +25,7 @@ from pre_core.fusion.information import (
     JointInformation,
     JointLayout,
 )
-from pre_core.fusion.likelihood import CrossingLikelihood, integrate_errors, linearised_likelihood
+from pre_core.fusion.likelihood import CrossingLikelihood, add_covariance, linearised_likelihood
 from pre_core.fusion.path_groups import (
     FusionInput,
     PathGroup,
@@ -68,6 +68,16 @@ class FusedDraws(NamedTuple):
     tracks: tuple[SharedMismatch, ...]
 
 
+def fuse(parts: Sequence[FusionInput], priors: BridgePriors, count: int, seed: int) -> FusedDraws:
+    """Return draws of a bridge, `count` of each chain, from crossings in coordinates of `priors`.
+
+    The order of the parts does not matter. Raise ValueError without parts.
+    """
+    if not parts:
+        raise ValueError("no crossings to fuse")
+    return sample_joint(build_joint(parts, priors), priors, count, seed)
+
+
 def sample_joint(
     information: JointInformation,
     priors: BridgePriors,
@@ -83,15 +93,11 @@ def sample_joint(
 
 
 def build_joint(
-    parts: Sequence[FusionInput],
-    priors: BridgePriors,
-    consistent: Collection[str] | None = None,
-    start: FloatArray | None = None,
+    parts: Sequence[FusionInput], priors: BridgePriors, consistent: Collection[str] | None = None
 ) -> JointInformation:
     """Return crossings with all own variables but the bridge's change integrated out.
 
-    Changes are relative to the estimate from all crossings, or from those named in `consistent`,
-    next to the bridge `start` (b,); None: the nominal one, first about each crossing's own.
+    Changes are relative to the estimate from all crossings, or from those named in `consistent`.
     """
     parts = sorted(parts, key=lambda part: part.name)
     tracks = path_groups(parts)
@@ -99,9 +105,9 @@ def build_joint(
     prior = _prior(layout, tracks)
     shared = tuple(track.shared for track in tracks.values())
     names = tuple(part.name for part in parts)
-    centre = _nominal(layout) if start is None else start
+    centre = _nominal(layout)
     for number in range(_PASSES):
-        bridge = None if number == 0 and start is None else centre
+        bridge = centre if number else None
         crossings = tuple(
             _crossing_information(
                 _linearised_about(part, tracks, bridge), layout, tracks, priors, centre
@@ -220,24 +226,22 @@ def _crossing_information(
     of, b = part.likelihood, layout.bridge
     truck = layout.trucks[part.truck]
     precision, linear = add_mass_parameter(of, part.mass_spread, priors, centre)
-    constant = -0.5 * float(of.target @ of.target)
     places = np.concatenate([np.arange(b), truck])
     key = path_group_key(part)
     if key in tracks:
-        unit = np.eye(linear.size)
         if part.name in tracks[key].short_roots:
-            moved = unit[:, :b] @ tracks[key].short_roots[part.name]
-            precision, linear, more = integrate_errors(precision, linear, moved)
-            constant += more
+            of_bridge = np.eye(linear.size)[:, :b]
+            root = tracks[key].short_roots[part.name]
+            precision, linear = add_covariance(precision, linear, of_bridge, root)
         q = of.knots_m.size
-        moved = unit[:, -q:] @ tracks[key].own_root
-        precision, linear, more = integrate_errors(precision, linear, moved)
-        constant += more
+        along = np.zeros((linear.size, q))
+        along[-q:] = np.eye(q)
+        precision, linear = add_covariance(precision, linear, along, tracks[key].own_root)
         if key in layout.tracks:
             places = np.concatenate([places, layout.tracks[key]])
         else:  # no other variable affects these waves
             precision, linear = precision[:-q, :-q], linear[:-q]
-    return CrossingInformation(precision, linear, places, constant)
+    return CrossingInformation(precision, linear, places)
 
 
 def add_mass_parameter(

@@ -264,23 +264,14 @@ def add_covariance(
     The columns `along` (n, r) add A S A' to the covariance; `root` (r, r) is a root of S, S = root
     root'. The precision may be singular.
     """
-    return integrate_errors(precision, linear, along @ root)[:2]
-
-
-def integrate_errors(
-    precision: FloatArray, linear: FloatArray, moved: FloatArray
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return precision (n, n) and linear part (n,) of a normal of which x has errors, integrated.
-
-    Its columns `moved` (n, r) are what unit normals do to x. The third value is the change of the
-    log density's constant.
-    """
+    moved = along @ root
     across = precision @ moved
-    factor = cho_factor(np.eye(moved.shape[1]) + moved.T @ across, lower=True)
-    pull = moved.T @ linear
-    solved = cho_solve(factor, np.column_stack([across.T, pull]))
-    constant = 0.5 * float(pull @ solved[:, -1]) - float(np.log(np.diag(factor[0])).sum())
-    return precision - across @ solved[:, :-1], linear - across @ solved[:, -1], constant
+    inner = np.eye(root.shape[1]) + moved.T @ across
+    factor = cho_factor(inner, lower=True)
+    return (
+        precision - across @ cho_solve(factor, across.T),
+        linear - across @ cho_solve(factor, moved.T @ linear),
+    )
 
 
 def _response_to_short_waves(found: Optimum) -> ShortWaveResponse:

@@ -161,7 +161,7 @@ def _thirds(found: FusedBridge) -> ThirdsState:
 
 
 class States:
-    """States of bridges, recomputed only after new crossings: one takes a second or two."""
+    """States of bridges, recomputed only after new crossings: one takes up to a second."""
 
     def __init__(self, fusing: Fusing) -> None:
         self.fusing = fusing

@@ -13,8 +13,7 @@ from pre_core.fusion import likelihood as of_crossing
 from pre_core.fusion.crossing_consistency import select_consistent
 from pre_core.fusion.curvature import CurvatureTerms
 from pre_core.fusion.information import BridgePriors
-from pre_core.fusion.joint import FusedDraws, build_joint
-from pre_core.fusion.modes import bridge_modes, sample_modes
+from pre_core.fusion.joint import FusedDraws, build_joint, sample_joint
 from pre_core.fusion.path_groups import FusionInput
 from pre_core.fusion.short_waves import ShortWaveResponse
 from pre_core.fusion.vehicle_consistency import find_misattributed
@@ -167,8 +166,7 @@ def fused(
     def drawing(stage: str, fraction: float) -> None:
         report(stage, _JOINED + (1.0 - _JOINED) * fraction)
 
-    modes = bridge_modes(parts, priors, information)
-    found = sample_modes(modes, priors, _DRAWS_PER_CHAIN, _SEED, drawing, threads)
+    found = sample_joint(information, priors, _DRAWS_PER_CHAIN, _SEED, drawing, threads)
     nominal = priors.coordinates.location[-priors.elements :]
     spread = priors.coordinates.scale[-priors.elements :]
     y = found.draws.reshape(-1, found.draws.shape[2])[:, -priors.elements :]

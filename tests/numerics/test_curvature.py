@@ -40,33 +40,33 @@ def rows(
 def drawn(seed: int) -> tuple[FloatArray, CurvatureTerms, FloatArray, FloatArray]:
     rng = np.random.default_rng(seed)
     root = rng.standard_normal((ROWS, BRIDGE + OTHERS + 1 + 2))
-    bridge = ABOUT + 0.6 * (DIRECTIONS @ rng.standard_normal(BRIDGE + 1))[:BRIDGE]
+    bridge = ABOUT + (DIRECTIONS @ rng.uniform(-0.4, 0.4, BRIDGE + 1))[:BRIDGE]
     return root, terms(rng), bridge, rng.normal(size=2)
 
 
 def test_about_the_truth_it_goes_through_the_truth() -> None:
     for seed in range(5):
         root, of, bridge, others = drawn(seed)
-        target = rows(root, of, bridge, others, 0.15)
+        target = rows(root, of, bridge, others, 0.05)
         straight, at = linearise_with_curvature(root, target, of, bridge, 1e-9 * np.eye(OTHERS))
         assert np.allclose(straight @ np.concatenate([bridge, others]), at, atol=1e-9)
 
 
 def test_beside_it_the_slope_is_that_of_the_curved_rows() -> None:
     root, of, bridge, others = drawn(7)
-    target = rows(root, of, bridge, others, 0.1)
+    target = rows(root, of, bridge, others, 0.05)
     straight, at = linearise_with_curvature(root, target, of, bridge, 1e-9 * np.eye(OTHERS))
     here = straight @ np.concatenate([bridge, others]) - at
 
     def apart(step: FloatArray, place: float) -> FloatArray:
         return rows(root, of, bridge + step, others, place) - target
 
-    along = (apart(np.zeros(3), 0.1 + 1e-6) - apart(np.zeros(3), 0.1 - 1e-6)) / 2e-6
+    along = (apart(np.zeros(3), 0.05 + 1e-6) - apart(np.zeros(3), 0.05 - 1e-6)) / 2e-6
     along /= np.linalg.norm(along)
     for i in range(BRIDGE):
         step = np.zeros(3)
         step[i] = 1e-6
-        slope = (apart(step, 0.1) - apart(-step, 0.1)) / 2e-6
+        slope = (apart(step, 0.05) - apart(-step, 0.05)) / 2e-6
         slope -= along * (along @ slope)  # what the place takes
         moved = straight @ np.concatenate([bridge + step, others]) - at
         assert np.allclose((moved - here) / 1e-6, slope, atol=1e-4)
@@ -79,7 +79,7 @@ def test_far_away_it_is_no_further_than_the_terms_apply() -> None:
     target = rows(root, of, ABOUT, others, 0.0)
     far, at_most = (
         linearise_with_curvature(root, target, of, ABOUT + moved, np.eye(OTHERS))
-        for moved in (50.0, 3.0 * size[:BRIDGE])
+        for moved in (50.0, 0.7 * size[:BRIDGE])
     )
     assert np.allclose(far[0], at_most[0], atol=1e-12)
 

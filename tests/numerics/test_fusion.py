@@ -13,7 +13,7 @@ from pre_core.crossing import mismatch as mm
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.posterior import layout, log_odds_of_absence
 from pre_core.fusion.information import BridgePriors
-from pre_core.fusion.joint import FusedDraws
+from pre_core.fusion.joint import FusedDraws, fuse
 from pre_core.fusion.lateral_wander import (
     SharedFraction,
     align_runs_m,
@@ -33,7 +33,6 @@ from pre_core.fusion.likelihood import (
     likelihood,
     long_share,
 )
-from pre_core.fusion.modes import fuse
 from pre_core.fusion.path_groups import FusionInput
 from pre_core.fusion.variability import BETWEEN_SCALE
 from pre_core.parameters import EI_1, mass_powers
