@@ -41,7 +41,11 @@ def next_steps(report: BridgeReport, language: Language) -> Iterator[str]:
             yield language.text("advice.check")
             yield language.text("advice.twice")
             return
-    yield language.text("advice.keep" if report.before is None else "advice.next_survey")
+    comparison = report.view.comparison
+    if report.before is not None:
+        yield language.text("advice.next_survey")
+    elif comparison is None or not comparison.implausible:
+        yield language.text("advice.keep")
 
 
 def advice(crossings: Iterable[CrossingResult], language: Language) -> list[str]:

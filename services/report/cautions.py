@@ -50,6 +50,8 @@ def cautions(measured: Measured, language: Language) -> Iterator[str]:
     comparison = measured.view.comparison
     if comparison is not None:
         yield from _implausible(comparison, language)
+    yield from _implausible_before(measured, language)
+    if comparison is not None:
         yield from _lower(measured.view, comparison, language)
         if comparison.weak or 2 * len(measured.view.unresolved) <= len(comparison.elements):
             limit = 100.0 * CLEAR_LOSS
@@ -68,10 +70,15 @@ def possibly_weak(view: BridgeView) -> tuple[Element, ...]:
 
 def weak_before(view: BridgeView, before: Before | None) -> tuple[Element, ...]:
     """Return the elements that were clearly less stiff than the others in the baseline."""
-    if before is None:
-        return ()
-    found = compare(before.estimate, view.nominal_nm2, view.edges_m)
+    found = _alone(view, before)
     return () if found is None else found.weak
+
+
+def _alone(view: BridgeView, before: Before | None) -> Comparison | None:
+    """Return the elements of the baseline, each compared with its others."""
+    if before is None:
+        return None
+    return compare(before.estimate, view.nominal_nm2, view.edges_m)
 
 
 def named_elements(numbers: Sequence[int], language: Language) -> str:
@@ -92,6 +99,18 @@ def _implausible(comparison: Comparison, language: Language) -> Iterator[str]:
         limit=100.0 * IMPLAUSIBLE_GAIN,
         neighbours=named_elements(near, language),
     )
+
+
+def _implausible_before(measured: Measured, language: Language) -> Iterator[str]:
+    """Yield that changes are not certain where the baseline itself is implausible."""
+    found = _alone(measured.view, measured.before)
+    numbers = [] if found is None else [element.number for element in found.implausible]
+    if numbers:
+        yield language.text(
+            "caution.implausible_before",
+            elements=named_elements(numbers, language),
+            limit=100.0 * IMPLAUSIBLE_GAIN,
+        )
 
 
 def _lower(view: BridgeView, comparison: Comparison, language: Language) -> Iterator[str]:

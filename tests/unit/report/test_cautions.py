@@ -81,6 +81,7 @@ def test_implausible_stiffness_alone_is_never_reassuring(site: Site) -> None:
     assert "least of all those of element 6." in text
     assert "no additional inspection" not in text
     assert "If the drawings show nothing stiffer at element 7" in text
+    assert "Keep these results as a baseline" not in text
 
 
 def test_gain_against_a_baseline_is_implausible_without_repair(site: Site, then: Path) -> None:
@@ -88,6 +89,19 @@ def test_gain_against_a_baseline_is_implausible_without_repair(site: Site, then:
     assert "But element 2 appears stiffer than is physically plausible." in text
     assert "Without a repair no bridge gains that, not even by frost." in text
     assert "plausible" not in first_page(reported(site, changed(site, 1.1), baseline=then))
+
+
+def test_implausible_baseline_takes_certainty_from_changes(site: Site, tmp_path: Path) -> None:
+    """A survey that found element 5 twice as stiff as the others is no measure of its loss."""
+    ratios = RATIOS.copy()
+    ratios[4] = 2.21
+    stiff = results_of(site, some_crossing("b"), used="b", ratios=ratios)
+    path = tmp_path / "stiff.json"
+    path.write_text(results_json(stiff))
+    words = "The baseline is not plausible: the 95 % interval of element 5 lies wholly more than 20"
+    now = results_of(site, some_crossing("z"), used="z")
+    assert words in first_page(reported(site, now, baseline=path))
+    assert "The baseline is not plausible" not in first_page(reported(site, now))
 
 
 def test_interval_without_zero_is_possibly_less_stiff(site: Site, then: Path) -> None:
