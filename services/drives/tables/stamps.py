@@ -165,8 +165,11 @@ def zone_of(name: str, where: str) -> tzinfo:
         ) from error
 
 
-def start_of(text: str, zone: tzinfo | None, where: str) -> float:
-    """Return the start of a drive, given as ISO 8601 or seconds since 1970."""
+def start_of(text: str, zone: tzinfo | None, where: str, *, has_zone_option: bool = True) -> float:
+    """Return the start of a drive, given as ISO 8601 or seconds since 1970.
+
+    Raise InputError for another text, or one without a zone, naming --zone if there is that option.
+    """
     try:
         if re.fullmatch(r"\d+(\.\d+)?", text):
             return float(text)
@@ -177,9 +180,11 @@ def start_of(text: str, zone: tzinfo | None, where: str) -> float:
         ) from error
     if start.tzinfo is None:
         if zone is None:
+            # Only a time of day can have a zone.
+            example = text if len(text) > len("2026-05-01") else f"{text}T09:30:00"
             raise InputError(
-                f'{where}: is "{text}", which has no zone: add one (as {text}Z, {text}+01:00), or '
-                "give --zone"
+                f'{where}: is "{text}", which has no zone: add one (as {example}Z, {example}+01:00)'
+                f"{', or give --zone' if has_zone_option else ''}"
             )
         start = start.replace(tzinfo=zone)
     return (start - datetime(1970, 1, 1, tzinfo=UTC)) / timedelta(seconds=1)
