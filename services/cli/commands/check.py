@@ -79,7 +79,7 @@ def _check(options: CheckOptions) -> int:
     print(
         f"{wrong} wrong, {left_open} open"
         if wrong or left_open
-        else "no finding speaks against a survey"
+        else "no finding speaks against a survey: driveby survey shows what it would detect"
     )
     return int(is_wrong)
 

@@ -89,4 +89,6 @@ def test_the_last_line_says_that_nothing_is_wrong(
     site = tmp_path / "site.toml"
     site.write_text(text.replace("[vehicle]\n", f"[vehicle]\n{known}", 1))
     assert cli.main(["check", str(site)]) == 0
-    assert capsys.readouterr().out.endswith("\nno finding speaks against a survey\n")
+    assert capsys.readouterr().out.endswith(
+        "\nno finding speaks against a survey: driveby survey shows what it would detect\n"
+    )
