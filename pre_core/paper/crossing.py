@@ -5,7 +5,7 @@ import numpy as np
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.paper import experiment
 from pre_core.paper.integrate import newmark_integrate
-from pre_core.paper.residual import PaperWindow, build_window
+from pre_core.paper.window import MeasuredCrossing, PaperWindow, build_window
 from pre_core.physics.bridge import Beam
 from pre_core.physics.road import iso_8608_profile, under_wheels
 from pre_core.physics.simulate import constant_speed, simulate
@@ -49,13 +49,15 @@ def paper_window(
         rng = np.random.default_rng(np.random.SeedSequence([seed, 0x6E]))
         acceleration = acceleration + sigma * rng.standard_normal(acceleration.shape)
     return build_window(
-        acceleration,
-        experiment.STEP_S,
-        motion.position_m,
-        1,
-        element_lengths_m=beam.element_lengths_m,
-        total_mass_kg=total_mass_kg(car),
-        wheelbase_m=car.wheelbase_m,
-        integrate=newmark_integrate,
-        initial_state_known=True,
+        MeasuredCrossing(
+            acceleration,
+            experiment.STEP_S,
+            motion.position_m,
+            1,
+            element_lengths_m=beam.element_lengths_m,
+            total_mass_kg=total_mass_kg(car),
+            wheelbase_m=car.wheelbase_m,
+            integrate=newmark_integrate,
+            initial_state_known=True,
+        )
     )

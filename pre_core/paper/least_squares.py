@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.paper.residual import PaperWindow, Workspace, residual_batch
+from pre_core.paper.residual import Workspace, residual_batch
+from pre_core.paper.window import PaperWindow
 from pre_core.parameters import D_1
 from pre_core.search import levenberg_marquardt
 from pre_core.search.levenberg_marquardt import (

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.kernels.lanes import LANES
-from pre_core.paper.residual import PaperWindow, Workspace, objective_batch, workspace
+from pre_core.paper.residual import Workspace, objective_batch, workspace
+from pre_core.paper.window import PaperWindow
 from pre_core.parameters import D_1
 from pre_core.search.loop import Termination
 

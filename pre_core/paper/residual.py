@@ -1,210 +1,29 @@
 """The paper's residual: the road under the front wheel less the road under the rear wheel.
 
 r_i = u_i - y_i (input less deflection) at each wheel; R_1(x) - R_2(x) vanishes for the right
-parameters, and J = integral of (R_1 - R_2)^2 dx (paper eq. 21). A `PaperWindow` holds everything
-that does not depend on the parameters.
-
-This module is long: J of four vectors, J of one, residuals and roads share the work arrays,
-and numba notices a changed kernel only in the same file.
+parameters, and J = integral of (R_1 - R_2)^2 dx (paper eq. 21). A `PaperWindow` (`window`) holds
+everything that does not depend on the parameters.
 """
 
-import itertools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.kernels.lanes import LANES, fma, fma_scalar, kernel, load, mul, scale, store, sub
-from pre_core.paper.iep import iep_factors, iep_signals, input_profiles
-from pre_core.paper.integrate import Integrated
+from pre_core.paper.iep import iep_factors, input_profiles
+from pre_core.paper.window import LONGEST_STRETCH, PaperWindow
 from pre_core.parameters import D_1, KAPPA, M_U1
 from pre_core.physics.beam_basis import (
-    BeamBasis,
     ModalFilters,
     WheelStretch,
     advance,
-    beam_basis,
     modal_filters,
     modal_filters_one,
 )
-from pre_core.physics.bridge import locate_element
-from pre_core.physics.simulate import rear_position_m
 from pre_core.physics.vehicle import masses_above_axles, masses_on_axles
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
-_LONGEST_STRETCH = 128  # steps: four vectors' work arrays of one stretch stay in the L1 cache
-_STENCIL = 2  # samples to either side that the cubic interpolation needs
-
-
-class PaperWindow(NamedTuple):
-    """One crossing, prepared for many evaluations.
-
-    n samples from shortly before the first axle enters until the last has left; m residuals while
-    the rear axle is on the compared stretch of road.
-    """
-
-    step_s: float
-    total_mass_kg: float
-    wheelbase_m: float
-    gravity_m_per_s2: float
-    acceleration: FloatArray  # (4, n)
-    load_transfer_n: FloatArray  # (n,): taken off the front axle's load, put on the rear's
-    signals: FloatArray  # (2, 4, n): see iep.py
-    stretches: IntArray  # (s, 4): first sample, last + 1, part under front, under rear (-1 none)
-    place: FloatArray  # (2, n): place 0..1 within the part
-    first_row: int  # sample of row 0
-    front_sample: IntArray  # (m,): first of the four samples at which the front passed the same x
-    front_weight: FloatArray  # (m, 4)
-    row_weight: FloatArray  # (m,): square root of dx
-    nuisance: FloatArray  # (m, q): orthonormal weighted columns projected out of the residuals
-    x_m: FloatArray  # (m,) chainage of the rows
-    basis: BeamBasis
-
-
-class WindowError(ValueError):
-    """An error of samples that do not cover the crossing; the message names the missing part."""
-
-
-def _stretches(element: IntArray) -> IntArray:
-    changes = np.flatnonzero(np.any(np.diff(element, axis=1) != 0, axis=0)) + 1
-    bounds = np.concatenate([[0], changes, [element.shape[1]]])
-    rows = [
-        (begin, min(begin + _LONGEST_STRETCH, stop), element[0, begin], element[1, begin])
-        for start, stop in itertools.pairwise(bounds)
-        for begin in range(start, stop, _LONGEST_STRETCH)
-    ]
-    return np.array(rows, dtype=np.int64)
-
-
-def _cubic_weights(travel: FloatArray, wanted: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return four-point Lagrange weights of a function of the increasing `travel` at `wanted`.
-
-    The variable is the sample number, in which the points are evenly spaced: the number belonging
-    to `wanted` is found by cubic interpolation too, so that a changing speed costs no accuracy.
-    """
-    sample = np.interp(wanted, travel, np.arange(travel.size))
-    base = np.clip(np.floor(sample).astype(np.int64) - 1, 0, travel.size - 4)
-    fraction = sample - base
-
-    def weights(f: FloatArray) -> FloatArray:
-        return np.stack(
-            [
-                -(f - 1.0) * (f - 2.0) * (f - 3.0) / 6.0,
-                f * (f - 2.0) * (f - 3.0) / 2.0,
-                -f * (f - 1.0) * (f - 3.0) / 2.0,
-                f * (f - 1.0) * (f - 2.0) / 6.0,
-            ],
-            axis=1,
-        )
-
-    points = travel[base[:, None] + np.arange(4)]
-    for _ in range(3):  # secant steps: travel is almost linear in the sample number
-        error = wanted - np.einsum("mj,mj->m", weights(fraction), points)
-        fraction = fraction + error / (points[:, 2] - points[:, 1])
-    return base, weights(fraction)
-
-
-def build_window(
-    acceleration_m_per_s2: FloatArray,
-    step_s: float,
-    front_position_m: FloatArray,
-    direction: int,
-    *,
-    element_lengths_m: FloatArray,
-    total_mass_kg: float,
-    wheelbase_m: float,
-    integrate: Callable[[FloatArray, float], Integrated],
-    initial_state_known: bool,
-    bias_known: bool = True,
-    speed_change_m_per_s2: FloatArray | None = None,
-    cg_height_m: float = 0.0,
-    gravity_m_per_s2: float = STANDARD_GRAVITY_M_PER_S2,
-    parts: int = 1,
-    coordinates: int | None = None,
-) -> PaperWindow:
-    """Prepare one crossing.
-
-    `acceleration_m_per_s2` (4, N) and `front_position_m` (N,) are evenly spaced in time by
-    `step_s`; `direction` is 1 driving from start to end, else -1. With `initial_state_known` the
-    truck was at rest at the first sample, as in the paper; otherwise the effect of unknown initial
-    displacement and velocity (and, unless `bias_known`, constant bias) is projected out of the
-    residual. `parts` and `coordinates` refine the beam (see `beam_basis`); defaults: the paper's.
-
-    Raise WindowError if the samples do not reach from the entry to the exit.
-    """
-    span = float(element_lengths_m.sum())
-    front = np.asarray(front_position_m, dtype=np.float64)
-    rear = rear_position_m(front, wheelbase_m, direction)
-    travel_front = front if direction > 0 else span - front
-    travel_rear = travel_front - wheelbase_m
-    # The first crossing only; the motion before and after it is arbitrary.
-    entry = int(np.argmax(travel_front >= 0.0))
-    leave = int(np.argmax(travel_rear > span))
-    if entry < _STENCIL:
-        raise WindowError("the samples begin after the front axle has entered the bridge")
-    if travel_rear[leave] <= span:
-        raise WindowError("the samples end before the rear axle has left the bridge")
-    begin = entry - _STENCIL
-    if np.any(np.diff(travel_front[begin : leave + 1]) <= 0.0):
-        raise WindowError("the truck stops or turns round during the crossing")
-    if initial_state_known:
-        signals = iep_signals(acceleration_m_per_s2, step_s, integrate)[:, :, begin : leave + 1]
-    else:
-        signals = iep_signals(acceleration_m_per_s2[:, begin : leave + 1], step_s, integrate)
-    part = slice(begin, leave + 1)
-    basis = beam_basis(element_lengths_m, parts, coordinates)
-    element, place = locate_element(basis.lengths_m, np.stack([front[part], rear[part]]))
-
-    first_row = int(np.argmax(travel_rear >= 0.0)) - begin
-    rows = slice(first_row + begin, leave)
-    base, weight = _cubic_weights(travel_front[part], travel_rear[rows])
-    if np.any(base + 3 >= np.arange(rows.start, rows.stop) - begin):
-        raise WindowError("the samples are too far apart for this wheelbase and speed")
-    dx = np.gradient(travel_rear)[rows]
-    row_weight = np.sqrt(dx)
-    columns: list[FloatArray] = []
-    if not initial_state_known:
-        t = step_s * np.arange(leave + 1 - begin, dtype=np.float64)
-        t_rear = t[rows.start - begin : rows.stop - begin]
-        t_front = np.einsum("mj,mj->m", weight, t[base[:, None] + np.arange(4)])
-        columns = [np.ones_like(t_rear), t_front, t_rear]
-        if not bias_known:
-            columns += [t_front**2, t_rear**2]
-    transfer = np.zeros(leave + 1 - begin)
-    if speed_change_m_per_s2 is not None:
-        transfer = total_mass_kg * cg_height_m / wheelbase_m * speed_change_m_per_s2[part]
-    return PaperWindow(
-        step_s,
-        total_mass_kg,
-        wheelbase_m,
-        gravity_m_per_s2,
-        np.ascontiguousarray(acceleration_m_per_s2[:, part]),
-        transfer,
-        np.ascontiguousarray(signals),
-        _stretches(element),
-        np.ascontiguousarray(place),
-        first_row,
-        base,
-        weight,
-        row_weight,
-        _orthonormal(columns, row_weight),
-        np.ascontiguousarray(rear[rows]),
-        basis,
-    )
-
-
-def _orthonormal(columns: list[FloatArray], row_weight: FloatArray) -> FloatArray:
-    if not columns:
-        return np.zeros((row_weight.size, 0))
-    matrix = np.stack(columns, axis=1) * row_weight[:, None]
-    matrix /= np.linalg.norm(matrix, axis=0)
-    u, s, _ = np.linalg.svd(matrix, full_matrices=False)
-    # At constant speed the columns are dependent to rounding; below 1e-9 a direction is noise.
-    return np.ascontiguousarray(u[:, s > 1e-9 * s[0]])
 
 
 class Workspace(NamedTuple):
@@ -229,7 +48,7 @@ def workspace(window: PaperWindow) -> Workspace:
         np.zeros((elements, m, 4, LANES)),
         np.zeros((m, 2, LANES)),
         np.zeros((m, 2, LANES)),
-        np.zeros((2, _LONGEST_STRETCH, LANES)),
+        np.zeros((2, LONGEST_STRETCH, LANES)),
         np.zeros((2, window.signals.shape[2], LANES)),
         np.zeros((window.nuisance.shape[1], LANES)),
     )
@@ -460,7 +279,7 @@ def objective(window: PaperWindow, work: Workspace, theta: FloatArray) -> float:
     for lane in range(LANES):
         for i in range(theta.size):
             four[lane, i] = theta[i]
-    scratch = np.empty((2, _LONGEST_STRETCH))
+    scratch = np.empty((2, LONGEST_STRETCH))
     factors = np.empty((13, LANES))
     _vehicle_factors(
         four, window.total_mass_kg, window.wheelbase_m, window.gravity_m_per_s2, factors

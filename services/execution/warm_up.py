@@ -23,6 +23,7 @@ from pre_core.crossing.preparation import CrossingInputs, build_problem
 from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.paper.crossing import paper_window
 from pre_core.paper.integrate import spline_integrate
+from pre_core.paper.window import MeasuredCrossing, build_window
 from pre_core.physics.models import from_models
 from pre_core.physics.simulate import constant_speed
 from pre_core.physics.vehicle import total_mass_kg
@@ -117,17 +118,19 @@ def _warm_up_paper() -> None:
     """Run the kernels of the paper's residual and searches, on noise from five metres before."""
     step_s = 0.01
     motion = constant_speed(-5.0, experiment.SPEED_M_PER_S, 450, step_s)
-    window = residual.build_window(
-        np.random.default_rng(0).standard_normal((4, motion.position_m.size)),
-        step_s,
-        motion.position_m,
-        1,
-        element_lengths_m=np.full(experiment.ELEMENTS, experiment.SPAN_M / experiment.ELEMENTS),
-        total_mass_kg=total_mass_kg(experiment.TRUCK),
-        wheelbase_m=experiment.TRUCK.wheelbase_m,
-        integrate=spline_integrate,
-        initial_state_known=False,
-        bias_known=False,
+    window = build_window(
+        MeasuredCrossing(
+            np.random.default_rng(0).standard_normal((4, motion.position_m.size)),
+            step_s,
+            motion.position_m,
+            1,
+            element_lengths_m=np.full(experiment.ELEMENTS, experiment.SPAN_M / experiment.ELEMENTS),
+            total_mass_kg=total_mass_kg(experiment.TRUCK),
+            wheelbase_m=experiment.TRUCK.wheelbase_m,
+            integrate=spline_integrate,
+            initial_state_known=False,
+            bias_known=False,
+        )
     )
     theta = from_models(experiment.TRUCK, _SOUND)
     free = parameters.paper_subset(experiment.ELEMENTS)

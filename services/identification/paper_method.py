@@ -14,7 +14,7 @@ from pre_core import parameters
 from pre_core.constants import NORMAL_975
 from pre_core.paper import least_squares, random_walk, residual
 from pre_core.paper.integrate import spline_integrate
-from pre_core.paper.residual import PaperWindow
+from pre_core.paper.window import MeasuredCrossing, PaperWindow, WindowError, build_window
 from pre_core.physics.bridge import natural_frequencies_hz, strain_energy_shares
 from pre_core.physics.models import body_masses
 from pre_core.physics.simulate import Motion
@@ -69,7 +69,7 @@ def identify_paper(
     """Return the result by `least_squares` or `random_walk`; its verdict is never `good`."""
     try:
         window = _window(data, settings, acceleration, motion)
-    except residual.WindowError:
+    except WindowError:
         return rejected(data, settings, passing, [Reason.STOPPED_ON_BRIDGE])
     fit = _METHODS[settings.method](data, settings, window, report)
     if fit.ending is loop.Termination.NOT_FINITE:
@@ -82,20 +82,22 @@ def _window(
 ) -> PaperWindow:
     vehicle = data.vehicle
     assert data.samples is not None  # noqa: S101 - `_unusable` checked it
-    return residual.build_window(
-        acceleration,
-        1.0 / data.samples.rate_hz,
-        motion.position_m,
-        data.stay.direction,
-        element_lengths_m=np.array(data.bridge.lengths_m),
-        total_mass_kg=vehicle.total_mass_kg,
-        wheelbase_m=vehicle.wheelbase_m,
-        integrate=spline_integrate,
-        initial_state_known=False,
-        bias_known=False,
-        speed_change_m_per_s2=motion.acceleration_m_per_s2,
-        cg_height_m=vehicle.cg_height_m or 0.0,
-        parts=settings.parts,
+    return build_window(
+        MeasuredCrossing(
+            acceleration,
+            1.0 / data.samples.rate_hz,
+            motion.position_m,
+            data.stay.direction,
+            element_lengths_m=np.array(data.bridge.lengths_m),
+            total_mass_kg=vehicle.total_mass_kg,
+            wheelbase_m=vehicle.wheelbase_m,
+            integrate=spline_integrate,
+            initial_state_known=False,
+            bias_known=False,
+            speed_change_m_per_s2=motion.acceleration_m_per_s2,
+            cg_height_m=vehicle.cg_height_m or 0.0,
+            parts=settings.parts,
+        )
     )
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pre_core import parameters
 from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.paper.crossing import paper_window
-from pre_core.paper.residual import PaperWindow
+from pre_core.paper.window import PaperWindow
 from pre_core.physics.bridge import Beam
 from pre_core.physics.models import body_masses, from_models
 from pre_core.physics.vehicle import HalfCar

@@ -21,7 +21,7 @@ from pre_core import parameters
 from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.paper.crossing import ROAD_CLASS, ROAD_SEED, paper_window
 from pre_core.paper.integrate import newmark_integrate, spline_integrate
-from pre_core.paper.residual import PaperWindow
+from pre_core.paper.window import MeasuredCrossing, PaperWindow, build_window
 from pre_core.physics.bridge import natural_frequencies_hz
 from pre_core.physics.models import from_models
 from pre_core.physics.vehicle import natural_frequencies_hz as vehicle_frequencies_hz
@@ -299,19 +299,21 @@ def mesh(scenarios: tuple[int, ...]) -> None:
                 (spline_integrate, "spline"),
             ):
                 for parts in (1, 2, 4):
-                    window = residual.build_window(
-                        np.stack([channel[part] for channel in drive.channels.values()]),
-                        1.0 / rate,
-                        position[part],
-                        1,
-                        element_lengths_m=np.full(
-                            experiment.ELEMENTS, experiment.SPAN_M / experiment.ELEMENTS
-                        ),
-                        total_mass_kg=site.vehicles[0].total_mass_kg,
-                        wheelbase_m=experiment.TRUCK.wheelbase_m,
-                        integrate=integrate,
-                        initial_state_known=False,
-                        parts=parts,
+                    window = build_window(
+                        MeasuredCrossing(
+                            np.stack([channel[part] for channel in drive.channels.values()]),
+                            1.0 / rate,
+                            position[part],
+                            1,
+                            element_lengths_m=np.full(
+                                experiment.ELEMENTS, experiment.SPAN_M / experiment.ELEMENTS
+                            ),
+                            total_mass_kg=site.vehicles[0].total_mass_kg,
+                            wheelbase_m=experiment.TRUCK.wheelbase_m,
+                            integrate=integrate,
+                            initial_state_known=False,
+                            parts=parts,
+                        )
                     )
                     found, _, _ = fit(window, np.ones(FREE.size))
                     errors = found / np.concatenate([np.ones(9), ratios, np.ones(3)]) - 1.0

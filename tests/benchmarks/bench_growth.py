@@ -7,7 +7,7 @@ import numpy as np
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from pre_core.paper import experiment, residual
-from pre_core.paper.residual import PaperWindow
+from pre_core.paper.window import PaperWindow
 from tests.benchmarks import cases
 
 _ROUNDS = 15

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pre_core import parameters
 from pre_core.paper import crossing, experiment, random_walk, residual
 from pre_core.paper.integrate import newmark_integrate
-from pre_core.paper.residual import PaperWindow
+from pre_core.paper.window import MeasuredCrossing, PaperWindow, build_window
 from pre_core.physics.bridge import Beam
 from pre_core.physics.models import body_masses, from_models
 from pre_core.physics.road import iso_8608_profile, under_wheels
@@ -97,18 +97,20 @@ def noise_window(
     travel = experiment.SPAN_M + experiment.TRUCK.wheelbase_m + 1.0
     steps = round(travel / speed_m_per_s / experiment.STEP_S)
     motion = constant_speed(-0.5, speed_m_per_s, steps, experiment.STEP_S)
-    return residual.build_window(
-        np.random.default_rng(0).standard_normal((4, steps)),
-        experiment.STEP_S,
-        motion.position_m,
-        1,
-        element_lengths_m=np.full(elements, experiment.SPAN_M / elements),
-        total_mass_kg=total_mass_kg(experiment.TRUCK),
-        wheelbase_m=experiment.TRUCK.wheelbase_m,
-        integrate=newmark_integrate,
-        initial_state_known=True,
-        parts=parts,
-        coordinates=coordinates,
+    return build_window(
+        MeasuredCrossing(
+            np.random.default_rng(0).standard_normal((4, steps)),
+            experiment.STEP_S,
+            motion.position_m,
+            1,
+            element_lengths_m=np.full(elements, experiment.SPAN_M / elements),
+            total_mass_kg=total_mass_kg(experiment.TRUCK),
+            wheelbase_m=experiment.TRUCK.wheelbase_m,
+            integrate=newmark_integrate,
+            initial_state_known=True,
+            parts=parts,
+            coordinates=coordinates,
+        )
     )
 
 

@@ -30,7 +30,6 @@ OFTEN = frozenset({"State", "Info", "Problem"})
 
 LONG_MODULES = {
     "pre_core.crossing.residuals": 742,
-    "pre_core.paper.residual": 567,
 }
 
 LONG_CLASSES = {
@@ -39,13 +38,11 @@ LONG_CLASSES = {
 
 LONG_FUNCTIONS = {
     "pre_core.monitoring.change_detection:detect_change": 65,
-    "pre_core.paper.residual:build_window": 87,
     "pre_core.physics.march:march": 140,
     "services.simulation.out_of_model:draw_out_of_model": 68,
 }
 
 MANY_ARGUMENTS = {
-    "pre_core.paper.residual:build_window": 15,
     "pre_core.physics.simulate:simulate": 11,
     "services.identification.engine:Engine.__init__": 8,
     "services.notebook.simulate:simulate": 10,

@@ -22,8 +22,6 @@ from pre_core.kernels.jacobi import diagonalise, diagonalise_one
 from pre_core.paper import experiment
 from pre_core.paper.integrate import newmark_integrate, spline_integrate
 from pre_core.paper.residual import (
-    PaperWindow,
-    build_window,
     deflections_m,
     objective,
     objective_batch,
@@ -31,6 +29,7 @@ from pre_core.paper.residual import (
     road_profiles,
     workspace,
 )
+from pre_core.paper.window import MeasuredCrossing, PaperWindow, build_window
 from pre_core.parameters import (
     ALPHA,
     BETA,
@@ -118,18 +117,20 @@ def make_case(name: str, scenario: int = 6) -> Case:
 
 def window_of(case: Case) -> PaperWindow:
     return build_window(
-        case.acceleration,
-        STEP_S,
-        case.motion.position_m,
-        case.direction,
-        element_lengths_m=LENGTHS,
-        total_mass_kg=total_mass_kg(experiment.TRUCK),
-        wheelbase_m=WHEELBASE,
-        integrate=spline_integrate if case.spline else newmark_integrate,
-        initial_state_known=case.initial_state_known,
-        bias_known=case.bias_known,
-        speed_change_m_per_s2=case.motion.acceleration_m_per_s2,
-        cg_height_m=case.cg_height_m,
+        MeasuredCrossing(
+            case.acceleration,
+            STEP_S,
+            case.motion.position_m,
+            case.direction,
+            element_lengths_m=LENGTHS,
+            total_mass_kg=total_mass_kg(experiment.TRUCK),
+            wheelbase_m=WHEELBASE,
+            integrate=spline_integrate if case.spline else newmark_integrate,
+            initial_state_known=case.initial_state_known,
+            bias_known=case.bias_known,
+            speed_change_m_per_s2=case.motion.acceleration_m_per_s2,
+            cg_height_m=case.cg_height_m,
+        )
     )
 
 

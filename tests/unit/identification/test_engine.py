@@ -663,7 +663,7 @@ def test_what_fails_inside_is_a_verdict(
     def fail(*_: object, **__: object) -> None:
         raise np.linalg.LinAlgError("SVD did not converge")
 
-    monkeypatch.setattr("pre_core.paper.residual.build_window", fail)
+    monkeypatch.setattr("services.identification.paper_method.build_window", fail)
     (crossing,) = results_in(fed(crossing_messages))
     assert (crossing.verdict, crossing.reasons) == ("rejected", ("failed",))
 

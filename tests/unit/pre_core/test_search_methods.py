@@ -16,7 +16,7 @@ from scipy.optimize import least_squares as least_squares_of_scipy
 from pre_core import parameters
 from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.paper.crossing import paper_window
-from pre_core.paper.residual import PaperWindow
+from pre_core.paper.window import PaperWindow
 from pre_core.physics.models import from_models
 from pre_core.search import levenberg_marquardt, loop
 from pre_core.search.loop import Termination
