@@ -8,6 +8,10 @@ workers compute while others wait.
 pytest-xdist 3.8 appends the group to a test's node id, which pytest 9.2 no longer lets it change
 (https://github.com/pytest-dev/pytest-xdist/issues/1386): the marks have no effect there. So the
 first worker writes the groups of its tests into a file that the scheduler of the controller reads.
+
+In a new checkout pytest rewrites the assertions of each file once, which takes longer than the
+rest of the collection. So each worker begins with other folders and finds the files of the others
+rewritten.
 """
 
 import json
@@ -46,6 +50,13 @@ def mostly_waits(item: pytest.Item) -> bool:
     return bool(listens or item.get_closest_marker("process"))
 
 
+def begun_at(folder: Path, share: float) -> list[str]:
+    """Return the folders of tests below one, from this share of them on, the first ones last."""
+    names = sorted({str(path.parent) for path in folder.rglob("test_*.py")})
+    first = int(share * len(names))
+    return names[first:] + names[:first]
+
+
 def interleaved(items: list[pytest.Item]) -> list[pytest.Item]:
     """Return groups first, then the other tests, those that mostly wait evenly between them."""
     parts: dict[bool, list[pytest.Item]] = {True: [], False: []}
@@ -65,6 +76,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Order the tests and give their groups to the controller, before it receives their ids."""
     given: dict[str, Any] = getattr(config, "workerinput", {})
     if given:
+        # One order for all workers, whichever folders they began with.
+        items.sort(key=lambda item: item.nodeid.partition("::")[0])
         items[:] = interleaved(items)
     if given.get("workerid") == "gw0":
         Path(given[_FILE]).write_text(json.dumps(groups_of(items)))
@@ -74,6 +87,10 @@ def pytest_configure(config: pytest.Config) -> None:
     folder = tempfile.TemporaryDirectory()
     config.add_cleanup(folder.cleanup)
     config.stash[_WRITTEN] = Path(folder.name) / "groups.json"
+    given: dict[str, Any] = getattr(config, "workerinput", {})
+    if given and config.args_source is pytest.Config.ArgsSource.TESTPATHS:
+        share = int(given["workerid"].removeprefix("gw")) / given["workercount"]
+        config.args[:] = [name for path in config.args for name in begun_at(Path(path), share)]
 
 
 @pytest.hookimpl(optionalhook=True)
