@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 
 INNER = ("pre_core", "schemas", "services")
+BACKEND = "from setuptools import build_meta; build_meta"
+"""What pip calls, too; pip itself starts further processes to ask what the build needs."""
 
 
 def sources(project: Path, folder: Path) -> Path:
@@ -21,8 +23,7 @@ def sources(project: Path, folder: Path) -> Path:
 def built(project: Path, folder: Path) -> Path:
     """Return the wheel after building it in an empty folder."""
     source = sources(project, folder)
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-index"]
-    command += ["--no-build-isolation", "--wheel-dir", str(source / "dist"), str(source)]
-    subprocess.run(command, check=True, capture_output=True)
+    command = [sys.executable, "-c", f"{BACKEND}.build_wheel({str(source / 'dist')!r})"]
+    subprocess.run(command, cwd=source, check=True, capture_output=True)
     (found,) = (source / "dist").glob("*.whl")
     return found
