@@ -50,8 +50,7 @@ def cautions(measured: Measured, language: Language) -> Iterator[str]:
     comparison = measured.view.comparison
     if comparison is not None:
         yield from _implausible(comparison, language)
-    yield from _implausible_before(measured, language)
-    if comparison is not None:
+        yield from _implausible_before(measured, language)
         yield from _lower(measured.view, comparison, language)
         if comparison.weak or 2 * len(measured.view.unresolved) <= len(comparison.elements):
             limit = 100.0 * CLEAR_LOSS
