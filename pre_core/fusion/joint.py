@@ -229,14 +229,12 @@ def _crossing_information(
     places = np.concatenate([np.arange(b), truck])
     key = path_group_key(part)
     if key in tracks:
+        unit = np.eye(linear.size)
         if part.name in tracks[key].short_roots:
-            of_bridge = np.eye(linear.size)[:, :b]
             root = tracks[key].short_roots[part.name]
-            precision, linear = add_covariance(precision, linear, of_bridge, root)
+            precision, linear = add_covariance(precision, linear, unit[:, :b], root)
         q = of.knots_m.size
-        along = np.zeros((linear.size, q))
-        along[-q:] = np.eye(q)
-        precision, linear = add_covariance(precision, linear, along, tracks[key].own_root)
+        precision, linear = add_covariance(precision, linear, unit[:, -q:], tracks[key].own_root)
         if key in layout.tracks:
             places = np.concatenate([places, layout.tracks[key]])
         else:  # no other variable affects these waves
