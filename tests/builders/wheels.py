@@ -6,8 +6,6 @@ import sys
 from pathlib import Path
 
 INNER = ("pre_core", "schemas", "services")
-BACKEND = "from setuptools import build_meta; build_meta"
-"""What pip calls, too; pip itself starts further processes to ask what the build needs."""
 
 
 def sources(project: Path, folder: Path) -> Path:
@@ -23,7 +21,8 @@ def sources(project: Path, folder: Path) -> Path:
 def built(project: Path, folder: Path) -> Path:
     """Return the wheel after building it in an empty folder."""
     source = sources(project, folder)
-    command = [sys.executable, "-c", f"{BACKEND}.build_wheel({str(source / 'dist')!r})"]
-    subprocess.run(command, cwd=source, check=True, capture_output=True)
+    # As pip does, which starts further processes to ask what the build needs.
+    build = "from setuptools import build_meta; build_meta.build_wheel('dist')"
+    subprocess.run([sys.executable, "-c", build], cwd=source, check=True, capture_output=True)
     (found,) = (source / "dist").glob("*.whl")
     return found
