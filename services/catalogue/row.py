@@ -3,13 +3,13 @@
 import hashlib
 import json
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from itertools import pairwise
 from typing import BinaryIO, Final, NamedTuple
 
 from schemas.signals import NS_PER_S, decode_accel, decode_gnss
 from schemas.topics import Key, topic
 from services.common.errors import InputError
+from services.common.language import utc_day
 from services.common.stores import Entry, Folder, opened
 from services.finding.bridges import Box
 from services.recordings.mcap_ranges import ChunkIndexes, chunk_messages, read_index
@@ -49,7 +49,7 @@ class CatalogRow(NamedTuple):
     @property
     def day(self) -> str:
         """Day of its first time, UTC."""
-        return f"{datetime.fromtimestamp(self.first_ns / NS_PER_S, UTC):%Y-%m-%d}"
+        return utc_day(self.first_ns / NS_PER_S)
 
 
 def row_of(folder: Folder, entry: Entry) -> CatalogRow:

@@ -1,10 +1,10 @@
 """SQL queries of a whole history, by DuckDB over its Parquet files, which it only reads."""
 
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from services.common.errors import InputError
+from services.common.language import utc_day
 from services.common.parquet_files import FILES
 from services.history.history_store import (
     CROSSINGS,
@@ -44,7 +44,7 @@ FROM parquet_kv_metadata($1) GROUP BY file_name
 def overview(folder: Path) -> QueryResult:
     """Return a row for each bridge: number of crossings and trucks, first and last time."""
     found = query(folder, _OVERVIEW)
-    rows = tuple((*row[:5], *(_day(time_s) for time_s in row[5:])) for row in found.rows)
+    rows = tuple((*row[:5], *(utc_day(time_s) for time_s in row[5:])) for row in found.rows)
     names = ("realm", "bridge", "crossings", "good", "trucks", "first", "last")
     return found._replace(columns=names, rows=rows)
 
@@ -100,7 +100,3 @@ def _files(folder: Path) -> tuple[list[str], tuple[str, ...]]:
         else:
             problems.append(wrong)
     return good, tuple(problems)
-
-
-def _day(time_s: float) -> str:
-    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"

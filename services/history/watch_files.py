@@ -5,7 +5,6 @@ the bridge then counts as unmonitored, and the next check covers it again.
 """
 
 from collections.abc import Iterable
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Final, Literal, NamedTuple
 
@@ -15,7 +14,7 @@ from schemas.alarms import Alarm
 from schemas.json_file import load_json
 from services.common.errors import InputError
 from services.common.files import make_folder, write_atomically
-from services.common.language import ENGLISH, Language
+from services.common.language import ENGLISH, Language, utc_day
 from services.history.alarm_files import ALARMS
 from services.history.history_store import HistoryRow
 from services.history.periods import Unit, begin_of
@@ -172,4 +171,4 @@ def _state(
 
 def day_of(time_s: float | None) -> str:
     """Return the day (UTC) of a time; an empty text for None."""
-    return "" if time_s is None else f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"
+    return "" if time_s is None else utc_day(time_s)

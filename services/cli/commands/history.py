@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from services.cli.alarm_line import alarm_line, day
+from services.cli.alarm_line import alarm_line
 from services.cli.parser import Subcommand
 from services.cli.parsing import EXIT_SOMETHING_LOST, a_console
 from services.common.errors import InputError
@@ -197,6 +197,7 @@ def _drawn(options: HistoryOptions, past: "BridgeHistory") -> Iterator[Path]:
 
 
 def _lines(past: "BridgeHistory") -> Iterator[str]:
+    from services.common.language import utc_day
     from services.history.bridge_history import statements
 
     bridge, realm, unit, periods, alarms = past[:5]
@@ -211,7 +212,7 @@ def _lines(past: "BridgeHistory") -> Iterator[str]:
     for one in periods:
         warm = "     " if one.temperature_deg_c is None else f"{one.temperature_deg_c:5.1f}"
         used = 0 if one.state is None else len(one.state.crossings_used)
-        head = f"{day(one.begin_s)}  {used:>3} of {one.crossings:<3} {warm}"
+        head = f"{utc_day(one.begin_s)}  {used:>3} of {one.crossings:<3} {warm}"
         if one.state is None or not one.state.elements:
             yield f"{head}  none of them could be used"
             continue
