@@ -173,21 +173,14 @@ def detect_change(
             rows[number] = standardised(state, innovation)
             inflation = max(1.0, (np.abs(rows[number]).max() / MAX_STANDARDISED) ** 2)
             drift = state.places["drift"]
-            weight: FloatArray | None = None
             if is_judged[number]:
-                # An outlier would move the baseline, and sound periods would pass for a change.
-                after = state
-                if inflation == 1.0:
-                    after, weight = update_state(state, innovation)
+                state, weight = _update_unless_outlier(state, innovation, inflation)
                 chart = update_chart(chart, number, kept, drift, weight, innovation, inflation)
-                state = after
                 ratio, _ = log_ratio(chart, state, number)
                 statistic[number] = _in_deviations(ratio)
-                if ratio > rules.threshold:
-                    verdict = chart_verdict(chart, state, number, rules.smallest)
-                    if verdict.probability >= PROBABILITY:
-                        found = _found(verdict, number, statistic[number])
-                        standing = _since(before[found.since], some[found.since : number + 1])
+                found = _alarm(chart, state, number, ratio, rules)
+                if found is not None:
+                    standing = _since(before[found.since], some[found.since : number + 1])
             else:
                 wider = innovation._replace(covariance=inflation * innovation.covariance)
                 state, weight = update_state(state, wider)
@@ -207,6 +200,28 @@ def detect_change(
     if found is not None:
         found = _with_interval(found, standing)
     return MonitoringResult(rows, is_judged, statistic, threshold, *_usual(state), found)
+
+
+def _update_unless_outlier(
+    state: BaselineState, innovation: Innovation, inflation: float
+) -> tuple[BaselineState, FloatArray | None]:
+    """Return the state after a judged period, and the Kalman gain (`update_state`).
+
+    An outlier, whose covariance is inflated, leaves the state as it is and has no gain: it would
+    move the baseline, and undamaged periods would pass for a change.
+    """
+    return update_state(state, innovation) if inflation == 1.0 else (state, None)
+
+
+def _alarm(
+    chart: Chart, state: BaselineState, number: int, ratio: float, rules: AlarmRules
+) -> Change | None:
+    """Return the change that the chart shows, if it is probably of interest; `ratio` is ln R."""
+    if ratio > rules.threshold:
+        verdict = chart_verdict(chart, state, number, rules.smallest)
+        if verdict.probability >= PROBABILITY:
+            return _found(verdict, number, _in_deviations(ratio))
+    return None
 
 
 def _with_interval(change: Change, standing: BaselineState) -> Change:

@@ -95,6 +95,17 @@ class OutOfModelTruth(NamedTuple):
     beyond: OutOfModelEffects
 
 
+class _LateralDraws(NamedTuple):
+    """Values of the effects that give truck or bridge a width."""
+
+    lane_offset_m: float
+    torsional_ratio: float
+    """First torsional natural frequency over the first one of bending."""
+    gyration_m: float
+    load_left_m: float
+    errors_of_pairs: Floats  # (3, 8): standard normals of `_pairs`
+
+
 def draw_out_of_model(site: Site, effect: str, seed: int) -> OutOfModelTruth:
     """Draw a crossing of one of EFFECTS; raise ValueError for any other."""
     if effect not in EFFECTS:
@@ -108,15 +119,11 @@ def draw_out_of_model(site: Site, effect: str, seed: int) -> OutOfModelTruth:
     left = _draw_departed(rng)
     tyres = rng.uniform(*TYRE_DAMPING_NS_PER_M, 2)
     share, length = float(rng.uniform(*FRICTION_SHARE)), float(rng.uniform(*FRICTION_LENGTH_M))
-    quiet, loud = BODY_NOISE_UG
-    body_noise = float(quiet * (loud / quiet) ** rng.uniform())
+    body_noise = _draw_log_uniform(rng, *BODY_NOISE_UG)
     bilinear, air = float(rng.uniform(*BILINEAR)), float(rng.uniform(*AIR_EXPONENT))
     spans = rng.uniform(*SPAN_M, int(rng.integers(SPANS[0], SPANS[1] + 1)))
     rear_offset = float(rng.uniform(*REAR_OFFSET_M))
-    side = 1.0 if rng.uniform() < 0.5 else -1.0
-    lane, ratio = side * float(rng.uniform(*LANE_OFFSET_M)), float(rng.uniform(*TORSIONAL_RATIO))
-    gyration, load_left = float(rng.uniform(*GYRATION_M)), float(rng.uniform(*LOAD_LEFT_M))
-    errors_of_pairs = rng.standard_normal((3, 8))
+    lateral = _draw_lateral(rng)
     pavement = _draw_pavement(rng)
 
     alone = effect != EVERYTHING
@@ -151,14 +158,10 @@ def draw_out_of_model(site: Site, effect: str, seed: int) -> OutOfModelTruth:
     if has(SURFACE) or has(PAVEMENT):
         paths = _paths(site, rear_offset, pavement if has(PAVEMENT) else PLAIN)
     width = None
-    if has(TORSION) or has(LEFT_AND_RIGHT):
-        width = Width(_paths(site, rear_offset, PLAIN))
-    if width is not None and has(TORSION):
-        torsion = Torsion(ratio * _undamaged_frequency_hz(site, beam), gyration)
-        width = width._replace(lane_offset_m=lane, torsion=torsion)
-    if width is not None and has(LEFT_AND_RIGHT):
-        sensors = _pairs(site, drawn, car, errors_of_pairs)
-        width = width._replace(load_left_m=load_left, sensors=sensors)
+    if has(TORSION):
+        width = _twisting(_paths(site, rear_offset, PLAIN), lateral, site, beam)
+    if has(LEFT_AND_RIGHT):
+        width = _leaning(_paths(site, rear_offset, PLAIN), lateral, site, drawn, car)
     truth = drawn._replace(
         car=car, beam=beam, conditions=conditions, left=beyond.left, paths=paths, width=width
     )
@@ -174,6 +177,32 @@ def _draw_departed(rng: np.random.Generator) -> DepartedVehicle:
     )
 
 
+def _draw_lateral(rng: np.random.Generator) -> _LateralDraws:
+    side = 1.0 if rng.uniform() < 0.5 else -1.0
+    return _LateralDraws(
+        side * float(rng.uniform(*LANE_OFFSET_M)),
+        float(rng.uniform(*TORSIONAL_RATIO)),
+        float(rng.uniform(*GYRATION_M)),
+        float(rng.uniform(*LOAD_LEFT_M)),
+        rng.standard_normal((3, 8)),
+    )
+
+
+def _twisting(paths: WheelPaths, lateral: _LateralDraws, site: Site, beam: Beam) -> Width:
+    """Return the width of a crossing off the axis of a deck that twists."""
+    frequency_hz = lateral.torsional_ratio * _undamaged_frequency_hz(site, beam)
+    torsion = Torsion(frequency_hz, lateral.gyration_m)
+    return Width(paths, lane_offset_m=lateral.lane_offset_m, torsion=torsion)
+
+
+def _leaning(
+    paths: WheelPaths, lateral: _LateralDraws, site: Site, drawn: CrossingTruth, car: HalfCar
+) -> Width:
+    """Return the width of a truck whose load is off its centre line, with sensors on both sides."""
+    sensors = _pairs(site, drawn, car, lateral.errors_of_pairs)
+    return Width(paths, load_left_m=lateral.load_left_m, sensors=sensors)
+
+
 def _undamaged_frequency_hz(site: Site, beam: Beam) -> float:
     """Return the first natural frequency of a beam with the nominal EI."""
     nominal = np.mean(site.bridges[0].nominal_flexural_rigidity_nm2)
@@ -184,11 +213,13 @@ def _undamaged_frequency_hz(site: Site, beam: Beam) -> float:
 
 
 def _draw_pavement(rng: np.random.Generator) -> Pavement:
-    def log_uniform(low: float, high: float) -> float:
-        return float(low * (high / low) ** rng.uniform())
+    roughness = _draw_log_uniform(rng, *DECK_ROUGHNESS)
+    largest_joint_m = float(rng.uniform(*LARGEST_JOINT_M))
+    return Pavement(roughness, largest_joint_m, _draw_log_uniform(rng, *ANISOTROPY))
 
-    roughness = log_uniform(*DECK_ROUGHNESS)
-    return Pavement(roughness, float(rng.uniform(*LARGEST_JOINT_M)), log_uniform(*ANISOTROPY))
+
+def _draw_log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(low * (high / low) ** rng.uniform())
 
 
 def _paths(site: Site, rear_offset_m: float, pavement: Pavement) -> WheelPaths:

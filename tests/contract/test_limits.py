@@ -37,9 +37,7 @@ LONG_CLASSES = {
 }
 
 LONG_FUNCTIONS = {
-    "pre_core.monitoring.change_detection:detect_change": 65,
     "pre_core.physics.march:march": 140,
-    "services.simulation.out_of_model:draw_out_of_model": 68,
 }
 
 MANY_ARGUMENTS = {
