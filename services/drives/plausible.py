@@ -9,7 +9,6 @@ import numpy as np
 from schemas.signals import CHANNELS
 from schemas.site import Site, Vehicle
 from services.common.errors import InputError
-from services.common.geodesy import on_plane_m
 from services.drives.runs import Run
 from services.drives.tables import judged
 from services.drives.tables.clocks import clock_note
@@ -18,8 +17,6 @@ from services.drives.tables.stamps import LATEST_UNIX_S
 from services.drives.tables.units import SPEED
 from services.finding.placed import middle_sensor
 
-_DRIVING_M: Final = 20.0
-"""Distance in m below which the speed column is not judged: fixes scatter by metres."""
 _SPEED_TOLERANCE: Final = 0.25
 _HIGHEST_M: Final = 9000.0
 """Highest altitude of a road in m."""
@@ -95,13 +92,11 @@ def _check_coordinates(run: Run, site: Site) -> None:
 
 def _check_speed(run: Run) -> None:
     gnss = run.gnss
-    north, west = on_plane_m(gnss.latitude_deg, gnss.longitude_deg)
-    straight = float(np.hypot(north[-1], west[-1]))
-    steps = 0.5 * (gnss.speed_m_per_s[1:] + gnss.speed_m_per_s[:-1]) * np.diff(gnss.time_s)
-    path = float(np.hypot(np.diff(north), np.diff(west)).sum())
-    if straight < max(_DRIVING_M, 0.9 * path):
+    ratio = judged.speed_ratio(
+        gnss.latitude_deg, gnss.longitude_deg, gnss.time_s, gnss.speed_m_per_s
+    )
+    if ratio is None:
         return
-    ratio = float(np.abs(steps).sum()) / straight
     unit = judged.speed_unit(ratio)
     if unit not in (None, "m/s"):
         raise InputError(

@@ -43,6 +43,9 @@ _SENTINELS: Final = (999.0, 999.9, 9999.0, 9999.9, 99999.0, 32767.0, 32768.0, 99
 """Numbers that loggers write where they have none, of either sign."""
 _MAX_ABSENT, _FAR_BEYOND = 0.2, 5.0
 _DRIVING_M: Final = 20.0
+"""Distance in m below which a speed is not judged: fixes scatter by metres."""
+_STRETCH_S: Final = 5.0
+"""Length in s of the stretches of a drive that turns."""
 _UNIT_TOLERANCE: Final = 0.04
 
 
@@ -166,18 +169,35 @@ def gravity_of(
 
 
 def speed_ratio(latitude: Floats, longitude: Floats, time_s: Floats, speed: Floats) -> float | None:
-    """Return a speed column over the speed of the positions; None without a straight drive."""
+    """Return a speed column over the speed of the positions; None without a straight stretch.
+
+    A drive that turns is compared on its straight stretches, whose median counts.
+    """
     north, west = on_plane_m(latitude, longitude)
-    straight = float(np.hypot(north[-1], west[-1]))
-    path = float(np.hypot(np.diff(north), np.diff(west)).sum())
-    if straight < max(_DRIVING_M, 0.9 * path):
-        # Fixes scatter, which lengthens a path through all of them.
-        every = max(1, round(1.0 / max(float(np.median(np.diff(time_s))), 1e-3)))
-        path = float(np.hypot(np.diff(north[::every]), np.diff(west[::every])).sum())
-        if straight < max(_DRIVING_M, 0.9 * path):
-            return None
-    steps = 0.5 * (speed[1:] + speed[:-1]) * np.diff(time_s)
-    return float(np.abs(steps).sum()) / straight
+    track = np.column_stack([time_s, north, west, speed])
+    whole = _straight_ratio(track)
+    if whole is not None:
+        return whole
+    ends = np.arange(time_s[0] + _STRETCH_S, time_s[-1], _STRETCH_S)
+    ratios = [_straight_ratio(part) for part in np.split(track, np.searchsorted(time_s, ends))]
+    known = [ratio for ratio in ratios if ratio is not None]
+    return float(np.median(known)) if known else None
+
+
+def _straight_ratio(track: Floats) -> float | None:
+    """Return the ratio for rows (n, 4) of time, north, west and speed; None unless straight."""
+    if len(track) < 2:
+        return None
+    time_s, speed = track[:, 0], track[:, 3]
+    straight = float(np.hypot(*(track[-1, 1:3] - track[0, 1:3])))
+    # Fixes scatter, which lengthens a path through all of them.
+    second = max(1, round(1.0 / max(float(np.median(np.diff(time_s))), 1e-3)))
+    for every in (1, second):
+        steps_m = np.diff(track[::every, 1:3], axis=0)
+        if straight >= max(_DRIVING_M, 0.9 * float(np.hypot(*steps_m.T).sum())):
+            driven_m = 0.5 * (speed[1:] + speed[:-1]) * np.diff(time_s)
+            return float(np.abs(driven_m).sum()) / straight
+    return None
 
 
 def speed_unit(ratio: float) -> str | None:
