@@ -1,7 +1,11 @@
-"""Messages of ROS 2 that Eclipse Cyclone DDS encodes, in a container that has nothing of ours."""
+"""Messages of ROS 2 that others encode, in programs that have nothing of ours.
+
+Eclipse Cyclone DDS runs in a container. Fast CDR is compiled here: apt install g++ libfastcdr-dev.
+"""
 
 import json
 import random
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -31,6 +35,21 @@ def wheels(engine: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     if done.returncode != 0:
         pytest.skip(f"{CYCLONE} cannot be downloaded: {done.stderr.strip().splitlines()[-1]}")
     return folder
+
+
+@pytest.fixture(scope="module")
+def fast_cdr(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the compiled program of Fast CDR."""
+    if shutil.which("g++") is None:
+        pytest.skip("no g++ for Fast CDR: apt install g++ libfastcdr-dev")
+    program = tmp_path_factory.mktemp("fast_cdr") / "fast_cdr"
+    source = ROOT / "tests" / "containers" / "fast_cdr.cpp"
+    command = ["g++", "-std=c++17", "-Wall", "-Werror", str(source), "-o", str(program)]
+    done = subprocess.run([*command, "-lfastcdr"], capture_output=True, text=True, check=False)
+    if "fastcdr/" in done.stderr and "No such file" in done.stderr:
+        pytest.skip("no library Fast CDR: apt install g++ libfastcdr-dev")
+    assert done.returncode == 0, done.stderr
+    return program
 
 
 def drawn(kind: str, random_: random.Random) -> dict[str, Any]:
@@ -82,6 +101,37 @@ def test_messages_of_cyclone_dds_are_those_of_rosbags(wheels: Path, folder: Path
             payload = bytes.fromhex(line)
             assert payload == ros2.encoded(of, message, little_endian=is_little)
             check(one, decode(of, payload))
+
+
+def test_messages_of_fast_cdr_are_those_of_rosbags(fast_cdr: Path, folder: Path) -> None:
+    random_ = random.Random(2)
+    messages = [drawn(kind, random_) for kind in ("Imu", "NavSatFix") for _ in range(MESSAGES)]
+    (folder / "messages.txt").write_text("".join(f"{line_of(one)}\n" for one in messages))
+    command = [fast_cdr, folder / "messages.txt"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    version, *lines = done.stdout.split()
+    print(f"Fast CDR {version}: {len(messages)} messages")
+    assert len(lines) == 4 * len(messages)
+    groups = zip(*(lines[place::4] for place in range(4)), strict=True)
+    has_padding = 0
+    for one, payloads in zip(messages, groups, strict=True):
+        of, message = made(one)
+        little, little_ones, big, big_ones = map(bytes.fromhex, payloads)
+        assert little == ros2.encoded(of, message, little_endian=True)
+        assert big == ros2.encoded(of, message, little_endian=False)
+        # Fast CDR leaves whatever the memory holds between fields.
+        for payload in (little, little_ones, big, big_ones):
+            check(one, decode(of, payload))
+        has_padding += little != little_ones
+    assert has_padding > MESSAGES
+
+
+def line_of(one: dict[str, Any]) -> str:
+    """Return a message as fast_cdr.cpp reads it."""
+    numbers = [number.hex() for number in one["numbers"]]
+    return " ".join(
+        map(str, [one["type"], *one["stamp"], json.dumps(one["frame"]), *one["integers"], *numbers])
+    )
 
 
 def check(one: dict[str, Any], decoded: object) -> None:
