@@ -18,7 +18,7 @@ from schemas.signals import (
 )
 from schemas.topics import Message
 from services.recordings.recording import read_messages, read_site
-from services.recordings.writer import RecordingWriter
+from services.recordings.writer import RecordingOrigin, RecordingWriter
 
 SAMPLE = Path(__file__).parents[1] / "recordings" / "sample" / "crossing.mcap"
 EXACT = Path(__file__).parent / "data" / "noise_free.mcap"
@@ -46,7 +46,7 @@ def drives(folder: Path, crossings: int, each: int = 1, source: Path = EXACT) ->
         path = folder / f"drive-{first:05d}.mcap"
         key = once[0][0].key
         writer = RecordingWriter(
-            path, reason="test", realm=key.realm, vehicle=key.identifier, site_toml=site
+            path, reason="test", origin=RecordingOrigin(key.realm, key.identifier, site)
         )
         for number in range(first, min(first + each, crossings)):
             for message in _later(once, number):

@@ -30,6 +30,7 @@ from services.identification.bridge_state import NOTHING_STORED, Fusing, with_co
 from services.identification.engine import Engine
 from services.identification.identify import Keep
 from services.identification.outputs import EngineOutput
+from services.identification.waiting import Validations
 from services.recordings.recording import program_version, read_messages, read_site
 
 _log = logging.getLogger(__name__)
@@ -112,7 +113,12 @@ def identify_drives(
     header = header_of(site, settings, time.time())
     fusing = fusing._replace(threads=settings.threads)
     engine = Engine(
-        site, settings, header, fusing, certificates=certificates, publishes_states=False
+        site,
+        settings,
+        header,
+        fusing,
+        validations=Validations(certificates or {}),
+        publishes_states=False,
     )
     _check_vehicles(drives.name, site, drives.drove)
     for message in drives.near:

@@ -30,7 +30,14 @@ from services.identification.outputs import (
     ValidationRequest,
     crossing_output,
 )
-from services.identification.waiting import FromRecording, Pending, Waiting, pending_of
+from services.identification.waiting import (
+    NO_VALIDATIONS,
+    FromRecording,
+    Pending,
+    Validations,
+    Waiting,
+    pending_of,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -46,10 +53,10 @@ class Engine:
     `header` is the head of every estimate, `fusing` the settings of fusions. Without
     `publishes_states` states are computed at the end only (`fuse_all`).
 
-    `certificates` are the hashes of known validation records; results name them. If they
-    `are_required` a crossing of a pair without one waits: a request is yielded, once for a pair,
-    the record is passed to `certify`, and `release` then yields the crossings that waited. While an
-    executor has no room, crossings of recorded trucks wait as well (`note_recorded`).
+    `validations` are the known validation records; results name them. If they are required a
+    crossing of a pair without one waits: a request is yielded, once for a pair, the record is
+    passed to `certify`, and `release` then yields the crossings that waited. While an executor has
+    no room, crossings of recorded trucks wait as well (`note_recorded`).
     """
 
     def __init__(
@@ -59,15 +66,14 @@ class Engine:
         header: ResultHeader,
         fusing: Fusing = NOTHING_STORED,
         *,
-        certificates: ValidationHashes | None = None,
-        are_required: bool = False,
+        validations: Validations = NO_VALIDATIONS,
         publishes_states: bool = True,
         has_room: Callable[[], bool] = lambda: True,
     ) -> None:
         self._settings = settings
         self._names = Names()
         self._finder = Finder(site, window_of(settings.method), self._names.recognise)
-        self._waiting = Waiting(certificates or {}, are_required=are_required, has_room=has_room)
+        self._waiting = Waiting(validations, has_room=has_room)
         self._states = BridgeStates(header, fusing, are_published=publishes_states)
         self._works = 0
         """Number of tasks up to now."""

@@ -2,11 +2,12 @@
 
 import logging
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
+from types import MappingProxyType
 from typing import NamedTuple
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.validation_records import VehicleBridgePair
+from schemas.validation_records import ValidationHashes, VehicleBridgePair
 from services.finding.crossing_data import Complete, CrossingData
 from services.identification.outputs import (
     IdentificationTask,
@@ -18,6 +19,18 @@ from services.identification.outputs import (
 _log = logging.getLogger(__name__)
 MAX_WAITING_CROSSINGS = 100
 """Maximum number of waiting crossings: half a megabyte each, or more."""
+
+
+class Validations(NamedTuple):
+    """The site validations known at the start."""
+
+    hashes: ValidationHashes = MappingProxyType({})
+    """Hashes of the known validation records; results name them."""
+    are_required: bool = False
+    """Whether a crossing of a pair without a validation record waits for one."""
+
+
+NO_VALIDATIONS = Validations()
 
 
 class Pending(NamedTuple):
@@ -64,24 +77,16 @@ class Waiting:
 
     Parameters
     ----------
-    certificates
-        Hashes of the known validation records; results name them.
-    are_required
-        Whether a crossing of a pair without a validation record waits for one.
+    validations
+        Known validation records, and whether they are required.
     has_room
         Whether a crossing would be started soon. Otherwise those of recorded trucks wait too, so
         that the caller is not delayed.
     """
 
-    def __init__(
-        self,
-        certificates: Mapping[VehicleBridgePair, str],
-        *,
-        are_required: bool,
-        has_room: Callable[[], bool],
-    ) -> None:
-        self._certificates = dict(certificates)
-        self._are_required = are_required
+    def __init__(self, validations: Validations, *, has_room: Callable[[], bool]) -> None:
+        self._certificates = dict(validations.hashes)
+        self._are_required = validations.are_required
         self._has_room = has_room
         self._recorded: frozenset[str] = frozenset()
         self._wanted: set[VehicleBridgePair] = set()
@@ -89,7 +94,7 @@ class Waiting:
 
     def retarget(
         self,
-        certificates: Mapping[VehicleBridgePair, str],
+        certificates: ValidationHashes,
         retargeted: Callable[[CrossingData], CrossingData | None],
     ) -> Iterator[ValidationRequest]:
         """Continue with the data and records of another site file; yield validation requests."""

@@ -33,7 +33,7 @@ from services.identification.known import CrossingRecord, search_hash
 from services.ledger.crossing_log import CrossingLog, PublishedResult
 from services.ledger.growing_json import AppendableResults
 from services.recordings.recording import is_being_written, read_info, read_messages
-from services.recordings.writer import RecordingWriter
+from services.recordings.writer import RecordingOrigin, RecordingWriter
 
 _log = logging.getLogger(__name__)
 KNOWN_AGE_S = 2 * 86_400.0
@@ -92,8 +92,7 @@ class ResultFiles:
             self._writer = RecordingWriter(
                 self.path,
                 reason="first result",
-                realm=message.key.realm,
-                site_toml=self._site_toml,
+                origin=RecordingOrigin(message.key.realm, site_toml=self._site_toml),
                 previous=self._previous,
             )
         self._writer.write(message)

@@ -43,7 +43,7 @@ from services.logger.open_file import (
 )
 from services.logger.own_events import OwnEvents
 from services.recordings.recording import Identities
-from services.recordings.writer import Misplaced, RecordingWriter
+from services.recordings.writer import Misplaced, RecordingOrigin, RecordingWriter
 
 _log = logging.getLogger(__name__)
 SYNC_PERIOD_S = 0.5
@@ -282,9 +282,9 @@ class FileWriter:
         writer = RecordingWriter(
             path,
             reason=reason,
-            realm=realm,
-            vehicle=None if vehicle == SERVICE_FILE else vehicle,
-            site_toml=self._place.site_toml,
+            origin=RecordingOrigin(
+                realm, None if vehicle == SERVICE_FILE else vehicle, self._place.site_toml
+            ),
             previous=previous,
             latched=latched or (),
             disk=self._disk,

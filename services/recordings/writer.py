@@ -39,6 +39,19 @@ Misplaced = Literal["deleted", "cut short", "moved"]
 """Kind of interference with a recording being written. A moved one still holds everything."""
 
 
+class RecordingOrigin(NamedTuple):
+    """The realm, truck and site of a recording's messages, where they are known."""
+
+    realm: str | None = None
+    vehicle: str | None = None
+    """Name of the only truck in it."""
+    site_toml: str | None = None
+    """Text of the site file."""
+
+
+UNKNOWN_ORIGIN = RecordingOrigin()
+
+
 class RecordingWriter:
     """A writer to the final name of a recording, so that a crash leaves a readable file.
 
@@ -53,9 +66,7 @@ class RecordingWriter:
         path: Path,
         *,
         reason: str,
-        realm: str | None = None,
-        vehicle: str | None = None,
-        site_toml: str | None = None,
+        origin: RecordingOrigin = UNKNOWN_ORIGIN,
         time_ns: int | None = None,
         previous: str | None = None,
         latched: Sequence[Message] = (),
@@ -90,10 +101,8 @@ class RecordingWriter:
             self._mcap = _begin(
                 lambda data: write_all(self._file, data),
                 {"reason": reason} | start,
-                realm=realm,
-                vehicle=vehicle,
-                site_toml=site_toml,
-                time_ns=time_ns,
+                origin,
+                time_ns,
             )
             for message in latched:
                 self.write(message)
@@ -222,17 +231,10 @@ def write_recording(
         raise InputError(f"{path}: there is no message to write")
     written = 0
     last_time_ns = first.log_time_ns
-    realm = first.key.realm
     vehicle = first.key.identifier if first.key.owner == "vehicle" else None
+    origin = RecordingOrigin(first.key.realm, vehicle, site_toml)
     with replaced_atomically(path, force=force) as temporary, temporary.open("wb") as file:
-        mcap = _begin(
-            file.write,
-            {"reason": reason},
-            realm=realm,
-            vehicle=vehicle,
-            site_toml=site_toml,
-            time_ns=first.log_time_ns,
-        )
+        mcap = _begin(file.write, {"reason": reason}, origin, first.log_time_ns)
         for message in chain([first], source):
             _add(mcap, message)
             written += 1
@@ -250,19 +252,16 @@ class _Mcap(NamedTuple):
 def _begin(
     write: Callable[[bytes], object],
     start: dict[str, str],
-    *,
-    realm: str | None,
-    vehicle: str | None,
-    site_toml: str | None,
+    origin: RecordingOrigin,
     time_ns: int | None,
 ) -> _Mcap:
     writer = McapWriter(write, library=f"driveby {program_version()}", chunk_bytes=CHUNK_BYTES)
     about = {"program": "driveby", "version": program_version(), "format": FORMAT}
-    about |= {"realm": realm} if realm else {}
-    about |= {"vehicle": vehicle} if vehicle else {}
+    about |= {"realm": origin.realm} if origin.realm else {}
+    about |= {"vehicle": origin.vehicle} if origin.vehicle else {}
     writer.add_metadata(ABOUT, about)
-    if site_toml is not None:
-        writer.add_attachment(SITE, "application/toml", site_toml.encode())
+    if origin.site_toml is not None:
+        writer.add_attachment(SITE, "application/toml", origin.site_toml.encode())
     now_ns = time.time_ns() if time_ns is None else time_ns
     writer.add_metadata(START, start | {"time_ns": str(now_ns)})
     return _Mcap(writer, {}, {})

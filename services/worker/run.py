@@ -32,6 +32,7 @@ from services.identification.bridge_state import Fusing
 from services.identification.engine import Engine
 from services.identification.known import search_hash
 from services.identification.methods import METHODS
+from services.identification.waiting import Validations
 from services.ledger.baselines import baselines_of
 from services.ledger.crossing_log import Ledger
 from services.ledger.runs import (
@@ -177,8 +178,10 @@ def _engine(asked: WorkerSettings, search: Search, execution: ProcessExecutor) -
         search.settings,
         search.header,
         search.fusing,
-        certificates=passed_validations(search.certificates, search.site, search.settings),
-        are_required=asked.records_are_required,
+        validations=Validations(
+            passed_validations(search.certificates, search.site, search.settings),
+            asked.records_are_required,
+        ),
         has_room=lambda: execution.has_room,
     )
 

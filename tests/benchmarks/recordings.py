@@ -23,7 +23,7 @@ from schemas.signals import (
 from schemas.topics import Key, Message
 from services.recordings.recording import read_identities, read_messages
 from services.recordings.recovery import describe, recover_recording
-from services.recordings.writer import RecordingWriter
+from services.recordings.writer import RecordingOrigin, RecordingWriter
 
 HOUR_BATCHES = 3600 * 20
 NOW_NS = 1_700_000_000_000_000_000
@@ -77,7 +77,7 @@ def drive() -> list[Message]:
 
 
 def write(path: Path, messages: list[Message]) -> None:
-    writer = RecordingWriter(path, reason="benchmark", realm="live", vehicle="truck-1")
+    writer = RecordingWriter(path, reason="benchmark", origin=RecordingOrigin("live", "truck-1"))
     for n, message in enumerate(messages):
         writer.write(message)
         if n % 1800 == 1799:

@@ -42,9 +42,7 @@ LONG_FUNCTIONS = {
 
 MANY_ARGUMENTS = {
     "pre_core.physics.simulate:simulate": 11,
-    "services.identification.engine:Engine.__init__": 8,
     "services.notebook.simulate:simulate": 10,
-    "services.recordings.writer:RecordingWriter.__init__": 9,
     "services.simulation.drive:simulate_drive": 12,
 }
 

@@ -23,7 +23,7 @@ from services.logger.housekeeping import Housekeeping, RetentionPolicy
 from services.logger.writer import FileWriter
 from services.recordings.recording import is_closed, read_info, read_messages, read_site
 from services.recordings.recovery import put_aside, recover_recording, recovered_path
-from services.recordings.writer import RecordingWriter, write_recording
+from services.recordings.writer import RecordingOrigin, RecordingWriter, write_recording
 from tests.waiting import LONGEST_S, until
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "crossing.mcap"
@@ -40,7 +40,7 @@ def fixes(number: int, vehicle: str = "truck-1", realm: str = "live") -> Iterato
 
 def crashed(path: Path, number: int = 50, *, every: int = 10) -> list[Message]:
     """Leave a recording as a writer does that dies: synced, without an end, torn."""
-    writer = RecordingWriter(path, reason="test", realm="live", vehicle="truck-1")
+    writer = RecordingWriter(path, reason="test", origin=RecordingOrigin("live", "truck-1"))
     messages = list(fixes(number))
     for n, message in enumerate(messages):
         writer.write(message)

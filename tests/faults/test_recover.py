@@ -25,7 +25,7 @@ from services.common.errors import FailureError, InputError
 from services.recordings.mcap_scan import MAX_RECORD_BYTES
 from services.recordings.recording import read_info, read_messages, read_site
 from services.recordings.recovery import Recovery, recover_recording, recovered_path
-from services.recordings.writer import RecordingWriter
+from services.recordings.writer import RecordingOrigin, RecordingWriter
 
 NOW_NS = 1_700_000_000_000_000_000
 CHUNKS = 60
@@ -65,7 +65,7 @@ def fixes(number: int, boot_id: int = 7) -> Iterator[Message]:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
     path = tmp_path_factory.mktemp("whole") / "a.mcap"
-    writer = RecordingWriter(path, reason="test", realm="live", site_toml=SITE)
+    writer = RecordingWriter(path, reason="test", origin=RecordingOrigin("live", site_toml=SITE))
     messages = list(fixes(CHUNKS * PER_CHUNK))
     chunks = []
     for first in range(0, len(messages), PER_CHUNK):

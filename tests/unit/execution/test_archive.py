@@ -38,7 +38,7 @@ from services.identification.identify import identify
 from services.identification.outputs import IdentificationTask
 from services.recordings.recording import read_messages
 from services.recordings.remote import Recording, RemoteRecording, recording_at
-from services.recordings.writer import RecordingWriter, write_recording
+from services.recordings.writer import RecordingOrigin, RecordingWriter, write_recording
 from tests.drives import EXACT, drives
 
 LEAST_SQUARES = IdentificationSettings(method="least_squares")
@@ -244,7 +244,7 @@ def test_a_recording_that_is_being_written_waits_until_it_is_closed(
     """Else a crossing that is not over would get a result, and later another one."""
     path = tmp_path / "new.mcap"
     messages = list(read_messages(five[1]))
-    writer = RecordingWriter(path, reason="test", realm=messages[0].key.realm)
+    writer = RecordingWriter(path, reason="test", origin=RecordingOrigin(messages[0].key.realm))
     for message in messages[: len(messages) // 4]:
         writer.write(message)
     writer.sync()

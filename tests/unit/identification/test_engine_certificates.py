@@ -14,6 +14,7 @@ from services.identification import waiting as under_test
 from services.identification.engine import Engine
 from services.identification.known import CrossingRecord, search_hash
 from services.identification.outputs import IdentificationTask, Output, ValidationRequest
+from services.identification.waiting import Validations
 from services.ledger.crossing_log import known_crossings
 from tests.identifications import Identifications
 from tests.unit.identification.test_engine_resume import (
@@ -46,8 +47,7 @@ class Asking:
             SITE,
             SETTINGS,
             HEADER,
-            certificates=certificates,
-            are_required=True,
+            validations=Validations(certificates or {}, are_required=True),
             has_room=lambda: has_room,
         )
         self.here = InlineExecutor(identify=Identifications(), stopwatch=lambda: 0.0)
@@ -146,7 +146,7 @@ def test_one_that_is_known_before_holds_up_nothing() -> None:
 
 
 def test_where_nobody_asks_results_name_one_that_is_known() -> None:
-    engine = Engine(SITE, SETTINGS, HEADER, certificates={PAIR: DIGEST})
+    engine = Engine(SITE, SETTINGS, HEADER, validations=Validations({PAIR: DIGEST}))
     here = InlineExecutor(identify=Identifications())
     outputs = [o for m in TWO for o in dispatch(engine, here, engine.feed(m.key, m.payload))]
     assert {o.result.certificate for o in outputs if o.result} == {DIGEST}
@@ -175,7 +175,8 @@ def test_another_pair_is_not_held_up() -> None:
     site = SITE.model_copy(update={"vehicles": (*SITE.vehicles, second)})
     other = VehicleBridgePair("truck-2", "bridge-1")
     asking = Asking()
-    asking.engine = Engine(site, SETTINGS, HEADER, certificates={other: DIGEST}, are_required=True)
+    known = Validations({other: DIGEST}, are_required=True)
+    asking.engine = Engine(site, SETTINGS, HEADER, validations=known)
     asking.fed(TWO)
     theirs = [m._replace(key=m.key._replace(identifier="truck-2")) for m in TWO]
     outputs = asking.fed(theirs)
@@ -189,7 +190,7 @@ def test_busiest_and_latest_pairs_are_printed_first() -> None:
         update={"vehicles": tuple(SITE.vehicles[0].model_copy(update={"id": n}) for n in names)}
     )
     asking = Asking()
-    asking.engine = Engine(site, SETTINGS, HEADER, are_required=True)
+    asking.engine = Engine(site, SETTINGS, HEADER, validations=Validations(are_required=True))
 
     def drives(name: str, messages: list[Message]) -> None:
         asking.fed(m._replace(key=m.key._replace(identifier=name)) for m in messages)

@@ -14,7 +14,7 @@ from schemas.topics import Key, Message
 from services.common.errors import FailureError
 from services.identification.known import search_hash
 from services.ledger.runs import EarlierRuns, MessageName, ResultFiles, read_earlier
-from services.recordings.writer import RecordingWriter
+from services.recordings.writer import RecordingOrigin, RecordingWriter
 
 REALM = "live"
 NOW_S = 1_800_000_000.0
@@ -57,7 +57,9 @@ def written(
 ) -> Path:
     """The file of a run; without `end` as a `kill -9` leaves it."""
     began_ns = None if began_s is None else round(began_s * 1e9)
-    writer = RecordingWriter(path, reason="test", realm=REALM, previous=previous, time_ns=began_ns)
+    writer = RecordingWriter(
+        path, reason="test", origin=RecordingOrigin(REALM), previous=previous, time_ns=began_ns
+    )
     for message in messages:
         writer.write(message)
         writer.sync()
@@ -122,7 +124,9 @@ def test_a_run_that_was_continued_long_enough_has_been_published_again(
 
 def test_a_run_that_goes_on_is_known_and_left_alone(tmp_path: Path) -> None:
     """Another worker with the same folder."""
-    writer = RecordingWriter(tmp_path / "results-1.mcap", reason="test", realm=REALM)
+    writer = RecordingWriter(
+        tmp_path / "results-1.mcap", reason="test", origin=RecordingOrigin(REALM)
+    )
     writer.write(estimate(0))
     writer.sync()
     os.utime(writer.path, (NOW_S, NOW_S))

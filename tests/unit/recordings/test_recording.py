@@ -18,7 +18,7 @@ from schemas.topics import Key, Message
 from services.common.errors import InputError
 from services.recordings.mcap_file import McapWriter
 from services.recordings.recording import read_identities, read_info, read_messages, read_site
-from services.recordings.writer import RecordingWriter, write_recording
+from services.recordings.writer import RecordingOrigin, RecordingWriter, write_recording
 
 START_NS = 1_700_000_000_000_000_000
 SITE = '[vehicle]\nid = "truck-1"  # ü\n'
@@ -151,7 +151,7 @@ def test_a_damaged_length_does_not_ask_for_memory(tmp_path: Path) -> None:
 
 def test_what_was_synced_is_readable_without_an_end(tmp_path: Path) -> None:
     path = tmp_path / "new" / "folder" / "a.mcap"
-    writer = RecordingWriter(path, reason="test", realm="live", site_toml=SITE)
+    writer = RecordingWriter(path, reason="test", origin=RecordingOrigin("live", site_toml=SITE))
     messages = list(fixes(10))
     for message in messages[:15]:
         writer.write(message)

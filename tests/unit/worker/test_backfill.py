@@ -17,8 +17,9 @@ from services.execution.inline import InlineExecutor
 from services.execution.processes import BackgroundResult, BackgroundTask, ProcessExecutor
 from services.identification.engine import Engine
 from services.identification.known import search_hash
+from services.identification.waiting import Validations
 from services.ledger.crossing_log import Ledger, known_crossings
-from services.recordings.writer import RecordingWriter
+from services.recordings.writer import RecordingOrigin, RecordingWriter
 from services.worker.backfill import Backfill
 from services.worker.recording_list import BackfillSource
 from tests.identifications import Identifications
@@ -125,7 +126,7 @@ def record(tmp_path: Path) -> Callable[..., Path]:
         ago_s: float = LONG_AGO_S,
     ) -> Path:
         path = tmp_path / REALM / "2026-01-01" / name
-        writer = RecordingWriter(path, reason="test", realm=REALM, site_toml=None)
+        writer = RecordingWriter(path, reason="test", origin=RecordingOrigin(REALM))
         now_ns = time.time_ns() - round(ago_s * 1e9)
         for message in messages:
             writer.write(message._replace(publish_time_ns=now_ns))
@@ -229,7 +230,7 @@ def test_without_a_certificate_they_stay_in_the_recording(
     tmp_path: Path, record: Callable[..., Path]
 ) -> None:
     record(TWO)
-    worker = Worker(tmp_path, are_required=True)
+    worker = Worker(tmp_path, validations=Validations(are_required=True))
     assert worker.go_on() == []
     pair = VehicleBridgePair("truck-1", "bridge-1")
     assert worker.wanted == [pair]
