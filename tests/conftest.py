@@ -10,6 +10,7 @@ import pytest
 from hypothesis import settings
 
 from services.security.settings import CertsSettings
+from services.simulation.drive import DrivenRoad
 from tests.endpoints import free_endpoint
 
 if TYPE_CHECKING:
@@ -98,4 +99,4 @@ def scenario_6() -> "SimulatedDrive":
     from pre_core.paper.experiment import scenario_ratios
     from services.simulation.drive import paper_site, simulate_drive
 
-    return simulate_drive(paper_site(), scenario_ratios(6), road_class="A", seed=1)
+    return simulate_drive(paper_site(), scenario_ratios(6), DrivenRoad("A", 1))

@@ -8,7 +8,7 @@ from pre_core.paper.integrate import newmark_integrate
 from pre_core.paper.window import MeasuredCrossing, PaperWindow, build_window
 from pre_core.physics.bridge import Beam
 from pre_core.physics.road import iso_8608_profile, under_wheels
-from pre_core.physics.simulate import constant_speed, simulate
+from pre_core.physics.simulate import Discretisation, constant_speed, simulate
 from pre_core.physics.vehicle import HalfCar, total_mass_kg
 
 ROAD_CLASS = "B"
@@ -40,7 +40,7 @@ def paper_window(
     begin, end = experiment.FRONT_AXLE_START_M - reach, np.ceil(span + reach)
     profile = iso_8608_profile(begin, end, 0.01, *road)
     ground = under_wheels(profile, motion, car.wheelbase_m, 1)
-    run = simulate(car, beam, motion, ground, experiment.STEP_S)
+    run = simulate(car, beam, motion, ground, Discretisation(experiment.STEP_S))
     if not run.converged:
         raise ArithmeticError("the simulation did not converge")
     acceleration = np.ascontiguousarray(run.acceleration_m_per_s2.T)

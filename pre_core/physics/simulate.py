@@ -46,6 +46,26 @@ class WheelRoad(NamedTuple):
     rate_m_per_s: FloatArray
 
 
+class Discretisation(NamedTuple):
+    """Time step, modes of the bridge, and the end of the iterations within a step."""
+
+    step_s: float
+    modes: int | None = None
+    """Number of modes; None: all of the mesh."""
+    tolerance: float = 1e-12
+    """Largest change of a contact force between two iterations, relative to the static axle load;
+    the paper uses 1e-3."""
+    max_iterations: int = 50
+
+
+class InitialVibration(NamedTuple):
+    """Vibration of the bridge, which is at rest until it begins."""
+
+    state: FloatArray  # (2, modes): displacement and velocity of `bridge.modes`
+    step: int | None = None
+    """Step of its beginning; None: entry of the first wheel, or time 0 if none enters."""
+
+
 class CoupledResponse(NamedTuple):
     """Response of truck and bridge; `converged` is False if the forces of a step did not."""
 
@@ -93,40 +113,28 @@ def simulate(
     beam: _bridge.Beam,
     motion: Motion,
     road: WheelRoad,
-    step_s: float,
+    scheme: Discretisation,
     *,
-    modes: int | None = None,
-    swing: FloatArray | None = None,
-    tolerance: float = 1e-12,
-    max_iterations: int = 50,
+    swing: InitialVibration | None = None,
     gravity_m_per_s2: float = STANDARD_GRAVITY_M_PER_S2,
-    swing_step: int | None = None,
 ) -> CoupledResponse:
     """Drive the truck along `motion` and return accelerations, forces and deflections.
 
     The truck starts at rest in static equilibrium on a flat road at height zero, without spring
-    friction, and the bridge at rest, unloaded. `swing` (2, modes) is the initial vibration:
-    displacement and velocity of the modes (`bridge.modes` of this beam and number) at `swing_step`,
-    by default when the first wheel enters, or time 0 if none does; until then the bridge is at
-    rest.
-
-    All `modes` of the mesh are kept unless fewer are requested. `tolerance` is the largest change
-    of a contact force between two iterations, relative to the static axle load; the paper uses
-    1e-3.
+    friction, and the bridge at rest, unloaded; `swing` is its initial vibration, in the modes of
+    this beam and number.
 
     Integrating the accelerations by the same scheme from zero gives the displacements to rounding.
     """
-    basis = _bridge.modes(beam, modes)
+    basis = _bridge.modes(beam, scheme.modes)
     bending, steps = basis.eigenvalues_per_s2.size, motion.position_m.size
     direction = 1 if motion.speed_m_per_s[0] >= 0.0 else -1
     rear = rear_position_m(motion.position_m, car.wheelbase_m, direction)
     wheels = np.stack([motion.position_m, rear], axis=1)
     element, place = _bridge.locate_element(beam.element_lengths_m, wheels)
-    if swing is None:
-        swing_step = -1
-    elif swing_step is None:
-        swing_step = int((element >= 0).any(axis=1).argmax())
-    bridge = _modal_bridge(beam, basis, swing, swing_step)
+    if swing is not None and swing.step is None:
+        swing = swing._replace(step=int((element >= 0).any(axis=1).argmax()))
+    bridge = _modal_bridge(beam, basis, swing)
     track = WheelTrack(
         element,
         place,
@@ -142,8 +150,9 @@ def simulate(
     count = bridge.eigenvalues.size
     widths = (4, 4, 4, 2, 2, count, count, 2)
     out = MarchOutputs(*(np.zeros((steps, width)) for width in widths))
-    truck = _truck_matrices(car, step_s, gravity_m_per_s2)
-    iterations = march(truck, bridge, track, MarchScheme(step_s, tolerance, max_iterations), out)
+    truck = _truck_matrices(car, scheme.step_s, gravity_m_per_s2)
+    steps_of = MarchScheme(scheme.step_s, scheme.tolerance, scheme.max_iterations)
+    iterations = march(truck, bridge, track, steps_of, out)
     bent = out._replace(q=out.q[:, :bending], qd=out.qd[:, :bending])
     return CoupledResponse(*bent, basis, iterations > 0, max(iterations, 0))
 
@@ -181,23 +190,24 @@ def _truck_matrices(car: _vehicle.HalfCar, step_s: float, gravity_m_per_s2: floa
 
 
 def _modal_bridge(
-    beam: _bridge.Beam, basis: _bridge.Modes, swing: FloatArray | None, swing_step: int
+    beam: _bridge.Beam, basis: _bridge.Modes, swing: InitialVibration | None
 ) -> ModalBridge:
     """Return the bridge in its modes of bending, followed by those of torsion."""
     twist = torsional_modes(beam)
     fixed = _bridge.supported_nodes(beam)
     cubics = _bridge.element_cubics(beam.element_lengths_m, fixed, basis.shapes)
     eigenvalues = np.concatenate([basis.eigenvalues_per_s2, twist.eigenvalues_per_s2])
-    vibration = np.zeros((2, eigenvalues.size))
-    if swing is not None:
-        vibration[:, : basis.eigenvalues_per_s2.size] = swing
+    vibration, vibration_step = np.zeros((2, eigenvalues.size)), -1
+    if swing is not None and swing.step is not None:
+        vibration[:, : basis.eigenvalues_per_s2.size] = swing.state
+        vibration_step = swing.step
     return ModalBridge(
         eigenvalues,
         np.concatenate([basis.damping_per_s, twist.damping_per_s]),
         np.concatenate([cubics, twist.cubics], axis=2),
         beam.element_lengths_m,
         vibration,
-        swing_step,
+        vibration_step,
     )
 
 

@@ -37,6 +37,8 @@ from services.common.files import write_atomically
 from services.common.interrupts import handled_by
 from services.recordings.recording import read_info, read_messages
 from services.simulation.drive import (
+    DrivenRoad,
+    Measurement,
     SimulatedDrive,
     declared_site,
     paper_site,
@@ -106,10 +108,8 @@ def _run(folder: Path, speed: float, noise: float, console: "Console", live: Liv
         drive = simulate_drive(
             site,
             experiment.scenario_ratios(SCENARIO),
-            road_class=ROAD_CLASS,
-            seed=SEED,
-            noise_ug_per_rthz=noise,
-            receiver_errors=noise > 0.0,
+            DrivenRoad(ROAD_CLASS, SEED),
+            Measurement(noise, has_receiver_errors=noise > 0.0),
         )
         temporary = Path(
             watching.enter_context(tempfile.TemporaryDirectory(prefix="driveby-demo-"))

@@ -16,6 +16,8 @@ from services.execution.blas import one_blas_thread
 from services.finding.placed import middle_site
 from services.notebook.read import Name, given_site
 from services.simulation.drive import (
+    DrivenRoad,
+    Measurement,
     OutOfModelEffects,
     SimulatedDrive,
     declared_site,
@@ -124,13 +126,10 @@ def simulate(
         drive = simulate_drive(
             known,
             ratios_of(known.bridges[0], scenario, ei),
-            road_class=given_road(road),
-            seed=seed,
-            noise_ug_per_rthz=noise,
+            DrivenRoad(given_road(road), seed),
+            Measurement(noise, rate_hz=rate, has_receiver_errors=gps_noise),
             speed_m_per_s=(begin, end),
             forward=direction == "start_to_end",
-            receiver_errors=gps_noise,
-            rate_hz=rate,
             beyond=OutOfModelEffects(twist=twist_of(known.bridges[0])),
         )
     return Simulation(drive, declared_site(known, noise, drive.run.rate_hz))

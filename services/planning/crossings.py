@@ -28,7 +28,7 @@ from services.common.errors import FailureError, InputError
 from services.drives.runs import Run
 from services.identification.footprints import footprints_of
 from services.simulation.data_alone import crossing_data_only, inputs_of_seen
-from services.simulation.drive import simulate_drive
+from services.simulation.drive import DrivenRoad, simulate_drive
 from services.simulation.drive_tandem import TandemDrive, tandem_case
 from services.simulation.wheel_paths import REAR_OFFSET_M
 from services.simulation.wide_crossings import drive_case
@@ -159,8 +159,7 @@ def _run(crossing: PlannedCrossing, road: PlannedRoad) -> Run:
     return simulate_drive(
         site,
         sound,
-        road_class=road.road_class,
-        seed=_ROAD_SEED,
+        DrivenRoad(road.road_class, _ROAD_SEED),
         speed_m_per_s=(speed, speed),
         forward=crossing.forward,
     ).run

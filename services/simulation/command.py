@@ -15,6 +15,8 @@ from services.common.progress import steps_bar
 from services.finding.placed import middle_site
 from services.simulation.drive import (
     DepartedVehicle,
+    DrivenRoad,
+    Measurement,
     OutOfModelEffects,
     declared_site,
     paper_site,
@@ -74,16 +76,16 @@ def _simulate_plane(
             drive = simulate_drive(
                 known,
                 ratios,
-                road_class=asked.road,
-                seed=asked.seed,
-                noise_ug_per_rthz=asked.noise,
+                DrivenRoad(asked.road, asked.seed, paths),
+                Measurement(
+                    asked.noise,
+                    rate_hz=asked.rate,
+                    has_receiver_errors=asked.gps_noise,
+                    seed=(of_noise, number) if number else of_noise,
+                ),
                 speed_m_per_s=asked.speed,
                 forward=asked.direction == "start_to_end",
-                receiver_errors=asked.gps_noise,
-                rate_hz=asked.rate,
                 beyond=effects,
-                paths=paths,
-                drive_seed=(of_noise, number) if number else of_noise,
             )
             drives.append(drive)
         declared = declared_site(known, asked.noise, drives[0].run.rate_hz)

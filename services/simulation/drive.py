@@ -26,7 +26,13 @@ from pre_core.physics.bridge import (
 from pre_core.physics.free_vibration import free_vibration_after
 from pre_core.physics.road import Profile, contact_patch_average, iso_8608_profile, under_axles
 from pre_core.physics.sensors import Accelerometer, measure_acceleration
-from pre_core.physics.simulate import CoupledResponse, constant_acceleration, simulate
+from pre_core.physics.simulate import (
+    CoupledResponse,
+    Discretisation,
+    InitialVibration,
+    constant_acceleration,
+    simulate,
+)
 from pre_core.physics.vehicle import HalfCar, static_axle_loads_n
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle
@@ -108,6 +114,22 @@ class DrivenRoad(NamedTuple):
     lane_offset_m: float = 0.0
 
 
+class Measurement(NamedTuple):
+    """Accelerometers and receiver of a simulated drive."""
+
+    noise_ug_per_rthz: float = 0.0
+    """Noise density of every accelerometer."""
+    rate_hz: float | None = None
+    """Sampling rate of the accelerometers; None: the highest of the site."""
+    has_receiver_errors: bool = False
+    """Whether the receiver has the errors of the site file, or none."""
+    seed: int | tuple[int, ...] | None = None
+    """Seed of noise and of the truck's lateral position; None: that of the road."""
+
+
+NO_ERRORS = Measurement()
+
+
 class SimulatedDrive(NamedTuple):
     """The measurements of a truck, and the truth."""
 
@@ -168,29 +190,24 @@ def write_drives(
 def simulate_drive(
     site: Site,
     rigidity_ratios: Floats,
+    road: DrivenRoad,
+    measurement: Measurement = NO_ERRORS,
     *,
-    road_class: str | Profile,
-    seed: int,
-    noise_ug_per_rthz: float = 0.0,
     speed_m_per_s: tuple[float, float] = (experiment.SPEED_M_PER_S, experiment.SPEED_M_PER_S),
     forward: bool = True,
-    receiver_errors: bool = False,
-    rate_hz: float | None = None,
     beyond: OutOfModelEffects = NO_EFFECTS,
-    paths: WheelPaths | None = None,
-    drive_seed: int | tuple[int, ...] | None = None,
 ) -> SimulatedDrive:
     """Drive the site's first truck over its first bridge.
 
     The speed changes evenly from the first to the second value between 3 s before the entry and the
-    end. A profile in place of a class is the road of both axles. With `paths` the road is a surface
-    of a class; `drive_seed` is that of noise and of the truck's
-    lateral position if it differs from the road's. Raise FailureError if the coupled simulation
-    does not converge.
+    end. A twist in `beyond` gives the offset of the lane. Raise FailureError if the coupled
+    simulation does not converge.
     """
     vehicle, bridge = site.vehicles[0], site.bridges[0]
     car, beam = with_effects(truck_of(vehicle), beam_of(bridge, rigidity_ratios), beyond)
-    rate = rate_hz or max(site.sensor.rate_hz)
+    if beyond.twist is not None:
+        road = road._replace(lane_offset_m=beyond.twist.lane_offset_m)
+    rate = measurement.rate_hz or max(site.sensor.rate_hz)
     every = max(1, round(1.0 / (rate * LONGEST_STEP_S)))
     step_s = 1.0 / (rate * every)
     begin, end = speed_m_per_s
@@ -206,23 +223,23 @@ def simulate_drive(
     sign = 1 if forward else -1
     start = -approach if forward else bridge.span_m + approach
     motion = constant_acceleration(start, sign * first_speed, acceleration, steps, step_s)
-    sensor = Accelerometer(rate, noise_density_ug_per_rthz=noise_ug_per_rthz)
+    sensor = Accelerometer(rate, noise_density_ug_per_rthz=measurement.noise_ug_per_rthz)
     run, roads = measured_run(
         bridge,
         car,
         beam,
         TimedMotion(motion, step_s, settle),
-        DrivenRoad(road_class, seed, paths, beyond.twist.lane_offset_m if beyond.twist else 0.0),
+        road,
         Instruments(
             (sensor,) * len(CHANNELS),
-            receiver_of(site, perfect=not receiver_errors),
-            np.random.default_rng(seed if drive_seed is None else drive_seed),
+            receiver_of(site, perfect=not measurement.has_receiver_errors),
+            np.random.default_rng(road.seed if measurement.seed is None else measurement.seed),
             vehicle.gps_antenna_to_front_axle_m,
         ),
         beyond.left,
     )[:2]
     ratios = np.asarray(rigidity_ratios, dtype=np.float64)
-    return SimulatedDrive(run, roads.front, ratios, None if paths is None else roads.rear)
+    return SimulatedDrive(run, roads.front, ratios, None if road.paths is None else roads.rear)
 
 
 def measured_run(
@@ -256,8 +273,10 @@ def measured_run(
     felt = under_axles(*roads, motion, car.wheelbase_m, sign)
     mesh = refine(beam, _PARTS)
     count = min(_MODES * (1 + len(mesh.interior_supports)), _freedoms(mesh))
-    swing = None if left is None else free_vibration_after(mesh, modes(mesh, count), *left)
-    fine = simulate(car, mesh, motion, felt, step_s, modes=count, swing=swing)
+    swing = None
+    if left is not None:
+        swing = InitialVibration(free_vibration_after(mesh, modes(mesh, count), *left))
+    fine = simulate(car, mesh, motion, felt, Discretisation(step_s, count), swing=swing)
     if not fine.converged:
         raise FailureError("the simulation did not converge: are the site's values possible?")
     recorded = fine.acceleration_m_per_s2[settling_steps:]

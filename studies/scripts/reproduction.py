@@ -26,7 +26,7 @@ from pre_core.physics.bridge import natural_frequencies_hz
 from pre_core.physics.models import from_models
 from pre_core.physics.vehicle import natural_frequencies_hz as vehicle_frequencies_hz
 from pre_core.search import loop
-from services.simulation.drive import paper_site, simulate_drive
+from services.simulation.drive import DrivenRoad, Measurement, paper_site, simulate_drive
 from studies.paper.scenarios import (
     NAMES,
     Cloud,
@@ -289,7 +289,7 @@ def mesh(scenarios: tuple[int, ...]) -> None:
     for scenario in scenarios:
         for rate in (1000.0, 200.0):
             ratios = experiment.scenario_ratios(scenario)
-            drive = simulate_drive(site, ratios, road_class="B", seed=1, rate_hz=rate).run
+            drive = simulate_drive(site, ratios, DrivenRoad("B", 1), Measurement(rate_hz=rate)).run
             time_s = drive.accel_time_s - drive.accel_time_s[0]
             position = experiment.SPEED_M_PER_S * (time_s - 3.0)
             # The span and a second on either side: integration over more only adds drift.

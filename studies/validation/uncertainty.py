@@ -24,7 +24,13 @@ from services.common.errors import InputError
 from services.drives.csv_import import read_folder
 from services.drives.runs import normalised
 from services.simulation.drawn import IdentifiedCrossing, identify_simulated
-from services.simulation.drive import declared_site, paper_site, simulate_drive
+from services.simulation.drive import (
+    DrivenRoad,
+    Measurement,
+    declared_site,
+    paper_site,
+    simulate_drive,
+)
 from studies.paper.tables import of_paper
 from studies.validation.bound import bound_at
 from studies.validation.calibration import (
@@ -125,13 +131,12 @@ def one_scenario(number: int, noise_ug: float, settings: IdentificationSettings)
     """
     site = paper_site()
     ratios = experiment.scenario_ratios(number)
+    # Every row has its own road and noise, so that an error of one draw is not in all of them.
     drive = simulate_drive(
         site,
         ratios,
-        road_class=_SCENARIO_ROAD,
-        seed=number,  # its own road and noise: an error of one draw is not in every row
-        noise_ug_per_rthz=noise_ug,
-        receiver_errors=True,
+        DrivenRoad(_SCENARIO_ROAD, number),
+        Measurement(noise_ug, has_receiver_errors=True),
     )
     (seen,) = identify_simulated(
         [drive.run], declared_site(site, noise_ug, drive.run.rate_hz), settings

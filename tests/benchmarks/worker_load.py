@@ -30,7 +30,13 @@ from services.bus.session import open_session
 from services.bus.subscription import Subscription
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
-from services.simulation.drive import declared_site, paper_site, simulate_drive
+from services.simulation.drive import (
+    DrivenRoad,
+    Measurement,
+    declared_site,
+    paper_site,
+    simulate_drive,
+)
 from tests.faults.day import APART_M, Fleet, place
 from tests.waiting import LONGEST_S
 
@@ -76,9 +82,8 @@ def drive_of(truck: int, site: Site, seconds: float) -> list[Message]:
     felt = simulate_drive(
         paper_site(),
         scenario_ratios(6),
-        road_class="A",
-        seed=1,
-        noise_ug_per_rthz=_NOISE,
+        DrivenRoad("A", 1),
+        Measurement(_NOISE),
         speed_m_per_s=(SPEED_M_PER_S, SPEED_M_PER_S),
     ).run
     way_s = (BRIDGES_OF_ONE * APART_M) / SPEED_M_PER_S

@@ -41,9 +41,7 @@ LONG_FUNCTIONS = {
 }
 
 MANY_ARGUMENTS = {
-    "pre_core.physics.simulate:simulate": 11,
     "services.notebook.simulate:simulate": 10,
-    "services.simulation.drive:simulate_drive": 12,
 }
 
 ROOMS_WITH_CODE = {

@@ -46,7 +46,7 @@ from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.recordings.recording import read_info, read_messages
 from services.recordings.writer import write_recording
-from services.simulation.drive import SimulatedDrive, paper_site, simulate_drive
+from services.simulation.drive import DrivenRoad, SimulatedDrive, paper_site, simulate_drive
 from services.viewer.crossing_view import VERDICT_COLOURS
 from services.viewer.live_layout import lane_entity
 from services.viewer.live_view import MAX_BRIDGES
@@ -122,7 +122,7 @@ def site() -> Site:
 def drives() -> tuple[SimulatedDrive, SimulatedDrive]:
     """A crossing there and one back, without noise: what a truck feels on any of the bridges."""
     there, back = (
-        simulate_drive(paper_site(), scenario_ratios(6), road_class="A", seed=1, forward=forward)
+        simulate_drive(paper_site(), scenario_ratios(6), DrivenRoad("A", 1), forward=forward)
         for forward in (True, False)
     )
     return there, back

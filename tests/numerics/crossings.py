@@ -30,6 +30,8 @@ from pre_core.physics.road import contact_patch_average, iso_8608_profile, under
 from pre_core.physics.sensors import Accelerometer, measure_acceleration
 from pre_core.physics.simulate import (
     CoupledResponse,
+    Discretisation,
+    InitialVibration,
     constant_speed,
     simulate,
 )
@@ -263,8 +265,8 @@ def simulated(
     low, high = motion.position_m.min() - 6.0, motion.position_m.max() + 6.0
     raw = iso_8608_profile(np.floor(low), np.ceil(high), 0.01, road_class, 1)
     felt = under_wheels(contact_patch_average(raw, 0.2), motion, car.wheelbase_m, sign)
-    state = None if swing is None else np.stack(swing)
-    run = simulate(car, refine(beam, 10), motion, felt, STEP_S, swing=state, swing_step=0)
+    state = None if swing is None else InitialVibration(np.stack(swing), 0)
+    run = simulate(car, refine(beam, 10), motion, felt, Discretisation(STEP_S), swing=state)
     assert run.converged
     settle = round(settle_s / STEP_S)
     sensor = Accelerometer(RATE_HZ)

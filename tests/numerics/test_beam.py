@@ -26,7 +26,13 @@ from pre_core.physics.bridge import (
     strain_energy_shares,
     uniform_beam,
 )
-from pre_core.physics.simulate import WheelRoad, constant_speed, deflection_m, simulate
+from pre_core.physics.simulate import (
+    Discretisation,
+    WheelRoad,
+    constant_speed,
+    deflection_m,
+    simulate,
+)
 from pre_core.physics.vehicle import static_axle_loads_n
 from pre_core.search.levenberg_marquardt import sixth_order_jacobian
 
@@ -304,7 +310,7 @@ def test_a_truck_that_stands_on_the_bridge_sinks_to_the_static_deflection(agree:
     steps = 4000
     smooth = WheelRoad(np.zeros((steps, 2)), np.zeros((steps, 2)))
     motion = constant_speed(16.3, 0.0, steps, 0.002)
-    run = simulate(experiment.TRUCK, beam, motion, smooth, 0.002)
+    run = simulate(experiment.TRUCK, beam, motion, smooth, Discretisation(0.002))
     loads = -np.array(static_axle_loads_n(experiment.TRUCK, 9.80665))
     axles = np.array([16.3, 11.9])
     x = np.concatenate([[SPAN * 4 / 7], axles])

@@ -18,6 +18,7 @@ from pre_core.physics.bridge import (
 from pre_core.physics.road import Profile, iso_8608_profile, under_wheels
 from pre_core.physics.simulate import (
     CoupledResponse,
+    Discretisation,
     Motion,
     WheelRoad,
     constant_acceleration,
@@ -64,7 +65,7 @@ def crossing(
         )
     motion = constant_acceleration(-1.0, 12.0, acceleration, round(seconds / step_s) + 1, step_s)
     road = smooth_road(motion, car, 1)
-    run = simulate(car, beam, motion, road, step_s, modes=modes, tolerance=tolerance)
+    run = simulate(car, beam, motion, road, Discretisation(step_s, modes, tolerance))
     assert run.converged
     return beam, motion, road, run
 
@@ -214,8 +215,10 @@ def test_driving_back_over_the_mirrored_bridge_feels_the_same() -> None:
     back = constant_acceleration(span + 5.0, -10.0, 0.3, steps, 0.001)
     np.testing.assert_allclose(back.position_m, span - there.position_m, atol=1e-12)
     car = FULL_CAR._replace(cg_height_m=1.1)
-    one = simulate(car, beam, there, under_wheels(road, there, 4.4, 1), 0.001)
-    other = simulate(car, mirrored, back, under_wheels(road_back, back, 4.4, -1), 0.001)
+    one = simulate(car, beam, there, under_wheels(road, there, 4.4, 1), Discretisation(0.001))
+    other = simulate(
+        car, mirrored, back, under_wheels(road_back, back, 4.4, -1), Discretisation(0.001)
+    )
     scale = np.abs(one.acceleration_m_per_s2).max(axis=0)
     assert np.all(
         np.abs(one.acceleration_m_per_s2 - other.acceleration_m_per_s2).max(axis=0) < 1e-7 * scale
@@ -224,7 +227,9 @@ def test_driving_back_over_the_mirrored_bridge_feels_the_same() -> None:
     np.testing.assert_allclose(
         deflection_m(beam, one, x), deflection_m(mirrored, other, span - x), atol=1e-10
     )
-    asymmetric = simulate(car, beam, back, under_wheels(road_back, back, 4.4, -1), 0.001)
+    asymmetric = simulate(
+        car, beam, back, under_wheels(road_back, back, 4.4, -1), Discretisation(0.001)
+    )
     difference = np.abs(one.acceleration_m_per_s2 - asymmetric.acceleration_m_per_s2).max(axis=0)
     assert np.all(difference > 1e-3 * scale)  # the bridge that is not mirrored is distinguished
 
@@ -253,7 +258,13 @@ def test_forces_that_do_not_settle_are_reported() -> None:
     beam = experiment.beam(np.ones(7))
     motion = constant_speed(-1.0, 12.0, 500, 0.001)
     road = smooth_road(motion, experiment.TRUCK, 1)
-    run = simulate(experiment.TRUCK, beam, motion, road, 0.001, tolerance=1e-15, max_iterations=2)
+    run = simulate(
+        experiment.TRUCK,
+        beam,
+        motion,
+        road,
+        Discretisation(0.001, tolerance=1e-15, max_iterations=2),
+    )
     assert not run.converged
 
 

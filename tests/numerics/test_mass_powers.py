@@ -8,7 +8,7 @@ from pre_core import parameters
 from pre_core.paper import experiment
 from pre_core.physics.models import beam_from, from_models
 from pre_core.physics.road import Profile, under_wheels
-from pre_core.physics.simulate import constant_speed, simulate
+from pre_core.physics.simulate import Discretisation, constant_speed, simulate
 from pre_core.physics.vehicle import HalfCar, total_mass_kg
 
 STEP_S = 0.005
@@ -50,7 +50,7 @@ def test_accelerations_stay_where_everything_follows_its_power_of_the_mass() -> 
             wave_speed_m_per_s=BEAM.torsional_wave_speed_m_per_s,
         )
         felt = under_wheels(road, motion, car.wheelbase_m, 1)
-        return simulate(car, beam, motion, felt, STEP_S).acceleration_m_per_s2
+        return simulate(car, beam, motion, felt, Discretisation(STEP_S)).acceleration_m_per_s2
 
     mass_kg = total_mass_kg(CAR)
     expected = accelerations(theta, mass_kg)

@@ -20,7 +20,13 @@ from pre_core.physics.bridge import (
 )
 from pre_core.physics.march import march
 from pre_core.physics.newmark import newmark_modal
-from pre_core.physics.simulate import WheelRoad, constant_speed, deflection_m, simulate
+from pre_core.physics.simulate import (
+    Discretisation,
+    WheelRoad,
+    constant_speed,
+    deflection_m,
+    simulate,
+)
 from pre_core.physics.vehicle import HalfCar
 
 FloatArray = NDArray[np.float64]
@@ -54,7 +60,7 @@ def midspan_of_sprung_mass(
     steps = round(span / speed / step_s) + 1
     smooth = WheelRoad(np.zeros((steps, 2)), np.zeros((steps, 2)))
     motion = constant_speed(0.0, speed, steps, step_s)
-    run = simulate(car, beam, motion, smooth, step_s, gravity_m_per_s2=g)
+    run = simulate(car, beam, motion, smooth, Discretisation(step_s), gravity_m_per_s2=g)
     assert run.converged
     return deflection_m(beam, run, np.array([0.5 * span]))[:, 0]
 

@@ -47,7 +47,13 @@ from pre_core.parameters import (
 )
 from pre_core.physics.models import from_models
 from pre_core.physics.road import iso_8608_profile, under_wheels
-from pre_core.physics.simulate import Motion, constant_acceleration, constant_speed, simulate
+from pre_core.physics.simulate import (
+    Discretisation,
+    Motion,
+    constant_acceleration,
+    constant_speed,
+    simulate,
+)
 from pre_core.physics.vehicle import HalfCar, total_mass_kg
 
 FloatArray = NDArray[np.float64]
@@ -101,7 +107,9 @@ def make_case(name: str, scenario: int = 6) -> Case:
     else:
         motion = constant_speed(start, direction * 10.0, 3800, STEP_S)
     road = iso_8608_profile(-15.0, 45.0, 0.05, "B", 3)
-    run = simulate(car, beam, motion, under_wheels(road, motion, WHEELBASE, direction), STEP_S)
+    run = simulate(
+        car, beam, motion, under_wheels(road, motion, WHEELBASE, direction), Discretisation(STEP_S)
+    )
     assert run.converged
     return Case(
         motion,

@@ -20,6 +20,8 @@ from services.drives.runs import Run
 from services.execution.offline import identify_recordings
 from services.simulation import drive as simulation
 from services.simulation.drive import (
+    DrivenRoad,
+    Measurement,
     beam_of,
     declared_site,
     measured_run,
@@ -56,10 +58,8 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
         drive = simulate_drive(
             site,
             scenario_ratios(6),
-            road_class="A",
-            seed=SEED,
-            noise_ug_per_rthz=NOISE_UG,
-            receiver_errors=True,
+            DrivenRoad("A", SEED),
+            Measurement(NOISE_UG, has_receiver_errors=True),
         )
     known = declared_site(site, NOISE_UG, drive.run.rate_hz)
     write_drive(path, drive, known)

@@ -23,7 +23,7 @@ from pre_core.paper import experiment
 from pre_core.parameters import ALPHA, BETA, C_U1, EI_1, K_ROT, K_U1, KAPPA, RHO_A, F
 from pre_core.physics.beam_basis import RIGID_M_PER_N, BeamBasis, beam_basis, change_basis
 from pre_core.physics.sensors import resample, white_noise
-from services.simulation.drive import paper_site, simulate_drive, truck_of
+from services.simulation.drive import DrivenRoad, paper_site, simulate_drive, truck_of
 from tests.numerics.crossings import (
     PARTS,
     Case,
@@ -53,9 +53,7 @@ def truth(scenario_6: "SimulatedDrive") -> Case:
 @pytest.fixture(scope="module")
 def backward() -> Case:
     site = paper_site()
-    drive = simulate_drive(
-        site, experiment.scenario_ratios(6), road_class="A", seed=1, forward=False
-    )
+    drive = simulate_drive(site, experiment.scenario_ratios(6), DrivenRoad("A", 1), forward=False)
     return case(drive, site, forward=False)
 
 
@@ -237,7 +235,7 @@ def test_load_moves_between_the_axles_while_accelerating() -> None:
     site = site.model_copy(update={"vehicles": (high,)})
     speeds = (9.0, 14.0)
     drive = simulate_drive(
-        site, experiment.scenario_ratios(6), road_class="A", seed=3, speed_m_per_s=speeds
+        site, experiment.scenario_ratios(6), DrivenRoad("A", 3), speed_m_per_s=speeds
     )
     here = case(drive, site, speeds=speeds)
     assert point(here).acceleration_m_per_s2[0, 0] > 0.5
@@ -255,7 +253,7 @@ def test_axles_coupled_by_the_pitch_inertia() -> None:
     site = paper_site()
     stubby = site.vehicles[0].model_copy(update={"pitch_inertia_ratio": 0.8})
     site = site.model_copy(update={"vehicles": (stubby,)})
-    here = case(simulate_drive(site, experiment.scenario_ratios(6), road_class="A", seed=1), site)
+    here = case(simulate_drive(site, experiment.scenario_ratios(6), DrivenRoad("A", 1)), site)
     left = in_noise(here, residual(here, point(here)))
     assert little(left), left
     uncoupled = point(here)

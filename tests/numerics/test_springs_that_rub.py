@@ -6,7 +6,13 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from pre_core.paper import experiment
-from pre_core.physics.simulate import CoupledResponse, WheelRoad, constant_speed, simulate
+from pre_core.physics.simulate import (
+    CoupledResponse,
+    Discretisation,
+    WheelRoad,
+    constant_speed,
+    simulate,
+)
 from pre_core.physics.vehicle import (
     HalfCar,
     air_spring_excess_n,
@@ -70,7 +76,7 @@ def driven(car: HalfCar, step_s: float, seconds: float, amplitude: float = 0.01)
         grown * 12.0 * k * np.cos(k * x) + 2.0 * t * np.exp(-(t**2)) * np.sin(k * x)
     )
     beam = experiment.beam(np.ones(7))
-    run = simulate(car, beam, motion, WheelRoad(height, rate), step_s)
+    run = simulate(car, beam, motion, WheelRoad(height, rate), Discretisation(step_s))
     assert run.converged
     return run
 

@@ -16,7 +16,14 @@ from pre_core.physics.bridge import (
 )
 from pre_core.physics.free_vibration import free_motion, free_vibration_after
 from pre_core.physics.newmark import newmark_modal
-from pre_core.physics.simulate import WheelRoad, constant_speed, deflection_m, simulate
+from pre_core.physics.simulate import (
+    Discretisation,
+    InitialVibration,
+    WheelRoad,
+    constant_speed,
+    deflection_m,
+    simulate,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -111,7 +118,9 @@ def test_simulation_takes_the_swing_on() -> None:
         steps = round(1.0 / step_s) + 1
         motion = constant_speed(-2.0, 10.0, steps, step_s)
         flat = WheelRoad(np.zeros((steps, 2)), np.zeros((steps, 2)))
-        run = simulate(light, beam, motion, flat, step_s, modes=5, swing=state)
+        run = simulate(
+            light, beam, motion, flat, Discretisation(step_s, 5), swing=InitialVibration(state)
+        )
         entry = round(0.2 / step_s)
         np.testing.assert_array_equal(run.modal_displacement[: entry - 1], 0.0)
         assert motion.position_m[entry] == pytest.approx(0.0, abs=1e-9)
@@ -137,7 +146,9 @@ def test_the_truck_feels_the_swing() -> None:
     middle = np.array([15.0])
 
     def drive(swing: FloatArray | None) -> FloatArray:
-        run = simulate(experiment.TRUCK, beam, motion, flat, step_s, modes=8, swing=swing)
+        scheme = Discretisation(step_s, 8)
+        given = None if swing is None else InitialVibration(swing)
+        run = simulate(experiment.TRUCK, beam, motion, flat, scheme, swing=given)
         return deflection_m(beam, run, middle)[:, 0]
 
     still = drive(None)

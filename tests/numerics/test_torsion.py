@@ -19,7 +19,7 @@ from pre_core.physics.beam_basis import beam_basis
 from pre_core.physics.bridge import Beam, FloatArray, refine, uniform_beam
 from pre_core.physics.models import from_models
 from pre_core.physics.road import Profile, under_wheels
-from pre_core.physics.simulate import constant_speed, simulate
+from pre_core.physics.simulate import Discretisation, constant_speed, simulate
 from pre_core.physics.torsion import NO_TORSION, TorsionBasis, torsion_basis
 from pre_core.physics.vehicle import static_axle_loads_n, total_mass_kg
 from tests.numerics.crossings import (
@@ -127,7 +127,9 @@ def test_simulated_twist_is_that_of_a_moving_force() -> None:
     soft = TRUCK._replace(
         tyre_stiffness_n_per_m=(3e4, 3e4), suspension_stiffness_n_per_m=(1e4, 1e4)
     )
-    run = simulate(soft, beam, motion, under_wheels(flat, motion, soft.wheelbase_m, 1), step_s)
+    run = simulate(
+        soft, beam, motion, under_wheels(flat, motion, soft.wheelbase_m, 1), Discretisation(step_s)
+    )
     loads = np.array(static_axle_loads_n(soft, 9.80665))
     t = step_s * np.arange(steps)
     span = 30.0
@@ -192,4 +194,4 @@ def test_simulation_of_a_twisting_deck_needs_a_wave_speed() -> None:
     flat = Profile(np.array([-20.0, 60.0]), np.zeros(2))
     road = under_wheels(flat, motion, TRUCK.wheelbase_m, 1)
     with pytest.raises(ValueError, match="wave speed"):
-        simulate(TRUCK, beam, motion, road, STEP_S)
+        simulate(TRUCK, beam, motion, road, Discretisation(STEP_S))

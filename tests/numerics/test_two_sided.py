@@ -12,6 +12,7 @@ from scipy.special import k1
 
 from pre_core.physics import simulate as plane
 from pre_core.physics.bridge import refine, uniform_beam
+from pre_core.physics.simulate import Discretisation
 from pre_core.physics.surface import Footprint, spectra, surface_density
 from pre_core.physics.vehicle import HalfCar, dahl_friction_n
 from services.simulation.two_sided import (
@@ -221,8 +222,7 @@ def test_in_the_middle_it_is_the_half_car(forward: bool, change: float) -> None:
         refine(beam, 10),
         plane.Motion(motion.position_m, motion.speed_m_per_s, motion.acceleration_m_per_s2),
         plane.WheelRoad(height, rate),
-        step_s,
-        modes=36,
+        Discretisation(step_s, 36),
         gravity_m_per_s2=GRAVITY,
     )
     assert theirs.converged

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from pre_core.paper import experiment
-from pre_core.physics.simulate import WheelRoad, constant_acceleration, constant_speed, simulate
+from pre_core.physics.simulate import (
+    Discretisation,
+    WheelRoad,
+    constant_acceleration,
+    constant_speed,
+    simulate,
+)
 from pre_core.physics.vehicle import (
     HalfCar,
     body_masses_kg,
@@ -105,7 +111,7 @@ def test_load_transfer(direction: float, acceleration: float, agree: Agree) -> N
     start = -500.0 if direction > 0.0 else 500.0
     motion = constant_acceleration(start, 20.0 * direction, acceleration, steps, 0.001)
     flat = WheelRoad(np.zeros((steps, 2)), np.zeros((steps, 2)))
-    run = simulate(car, experiment.beam(np.ones(7)), motion, flat, 0.001)
+    run = simulate(car, experiment.beam(np.ones(7)), motion, flat, Discretisation(0.001))
     front, rear = static_axle_loads_n(car, 9.80665)
     transfer = total_mass_kg(car) * acceleration * 1.2 / car.wheelbase_m
     pressed = -run.contact_force_n[-1]
@@ -136,7 +142,7 @@ def test_contact_forces_are_the_weight_and_the_inertia_of_all_masses() -> None:
     motion = constant_speed(-2.0, 15.0, steps, 0.001)
     height = np.cumsum(rng.standard_normal((steps, 2)), axis=0) * 1e-5
     road = WheelRoad(height, np.gradient(height, 0.001, axis=0))
-    run = simulate(car, experiment.beam(np.ones(7)), motion, road, 0.001)
+    run = simulate(car, experiment.beam(np.ones(7)), motion, road, Discretisation(0.001))
     d_1 = car.front_axle_to_cg_m
     a = run.acceleration_m_per_s2
     heave = (a[:, 0] * (car.wheelbase_m - d_1) + a[:, 1] * d_1) / car.wheelbase_m

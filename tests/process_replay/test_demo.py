@@ -20,7 +20,7 @@ from schemas.signals import CHANNELS, decode_accel
 from services.cli import main as cli
 from services.drives.runs import run_to_messages
 from services.recordings.recording import read_info, read_messages
-from services.simulation.drive import paper_site, simulate_drive
+from services.simulation.drive import DrivenRoad, Measurement, paper_site, simulate_drive
 from tests.builders.commands import run
 from tests.waiting import LONGEST_S, until
 
@@ -122,10 +122,8 @@ def test_the_recording_is_what_the_truck_measured(demo: Demo) -> None:
     drive = simulate_drive(
         paper_site(),
         np.array(RATIOS),
-        road_class="A",
-        seed=1,
-        noise_ug_per_rthz=NOISE_UG,
-        receiver_errors=True,
+        DrivenRoad("A", 1),
+        Measurement(NOISE_UG, has_receiver_errors=True),
     )
     messages = list(read_messages(demo.folder / "recording.mcap"))
     sent = list(run_to_messages([drive.run], paper_site(), "x", "truck-1"))

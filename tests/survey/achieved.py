@@ -11,6 +11,8 @@ import os
 import sys
 from typing import NamedTuple
 
+from services.simulation.drive import DrivenRoad, Measurement
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
@@ -97,14 +99,11 @@ def achieved(row: Row, runs: int) -> Achieved:
                 simulate_drive(
                     site,
                     np.ones(7),
-                    road_class="A",
-                    seed=100 if paths else 100 + run,
-                    noise_ug_per_rthz=row.noise_ug,
+                    DrivenRoad("A", 100 if paths else 100 + run, paths),
+                    Measurement(
+                        row.noise_ug, rate_hz=RATE_HZ, has_receiver_errors=True, seed=(7, run)
+                    ),
                     speed_m_per_s=(row.speed_m_per_s,) * 2,
-                    receiver_errors=True,
-                    rate_hz=RATE_HZ,
-                    paths=paths,
-                    drive_seed=(7, run),
                 ).run
             ],
             site,

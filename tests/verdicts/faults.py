@@ -20,6 +20,7 @@ from pre_core.physics.sensors import (
     measure_acceleration,
     measure_position,
 )
+from pre_core.physics.simulate import Discretisation
 from pre_core.physics.vehicle import HalfCar
 from schemas.results import BridgeResult, CrossingResult, ResultHeader
 from schemas.settings import IdentificationSettings
@@ -141,7 +142,7 @@ def crossing(truth: Truth, fault: Fault = NOTHING) -> Case:
     if fault.second_vehicle_kg > 0.0:
         road = _with_second_vehicle(truth, fault, motion, road, beam, fine_hz, settle)
     modes = min(_MODES, 2 * bridge.elements * _PARTS)
-    done = forward.simulate(car, beam, motion, road, 1.0 / fine_hz, modes=modes)
+    done = forward.simulate(car, beam, motion, road, Discretisation(1.0 / fine_hz, modes))
     assert done.converged
     acceleration = done.acceleration_m_per_s2[settle:]
     accel_rng, gnss_rng, fault_rng = np.random.default_rng(truth.seed + 7919).spawn(3)
@@ -244,7 +245,7 @@ def _with_second_vehicle(
     low, high = np.floor(own.position_m.min() - 5.0), np.ceil(own.position_m.max() + 5.0)
     raw = iso_8608_profile(low, high, 0.01, truth.road_class, truth.seed + 1)
     felt = under_wheels(contact_patch_average(raw, 0.2), own, other.wheelbase_m, int(-sign))
-    run = forward.simulate(other, beam, own, felt, 1.0 / fine_hz, modes=_MODES)
+    run = forward.simulate(other, beam, own, felt, Discretisation(1.0 / fine_hz, _MODES))
     x = np.linspace(0.0, span, 61)
     deflection = forward.deflection_m(beam, run, x)
     front = motion.position_m

@@ -20,7 +20,14 @@ from services.identification.bridge_state import (
     state_of,
     usable,
 )
-from services.simulation.drive import declared_site, paper_site, simulate_drive, write_drives
+from services.simulation.drive import (
+    DrivenRoad,
+    Measurement,
+    declared_site,
+    paper_site,
+    simulate_drive,
+    write_drives,
+)
 from tests.verdicts.faults import errors_of
 
 NOISE_UG, RATE_HZ = 25.0, 500.0
@@ -46,13 +53,9 @@ def crossings(tmp_path_factory: pytest.TempPathFactory) -> tuple[CrossingResult,
         simulate_drive(
             site.model_copy(update={"vehicles": (truck,)}),
             RATIOS,
-            road_class="A",
-            seed=SEED,
-            noise_ug_per_rthz=NOISE_UG,
+            DrivenRoad("A", SEED),
+            Measurement(NOISE_UG, rate_hz=RATE_HZ, has_receiver_errors=True, seed=(SEED, number)),
             speed_m_per_s=(float(speed), float(speed)),
-            receiver_errors=True,
-            rate_hz=RATE_HZ,
-            drive_seed=(SEED, number),
         )
         for number, (truck, speed) in enumerate(zip(trucks, SPEEDS_M_PER_S, strict=True))
     ]

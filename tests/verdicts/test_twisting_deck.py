@@ -18,7 +18,7 @@ from schemas.site_file import load_site
 from services.drives.csv_import import read_folder
 from services.drives.runs import normalised
 from services.simulation.drawn import default_site, drive, identify_simulated
-from services.simulation.drive import simulate_drive
+from services.simulation.drive import DrivenRoad, Measurement, simulate_drive
 from services.simulation.out_of_model import draw_out_of_model
 from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
 from tests.verdicts.faults import errors_of
@@ -76,14 +76,9 @@ def test_search_leaves_ends_that_are_held(shared: Path) -> None:
     drive = simulate_drive(
         site,
         truth,
-        road_class="A",
-        seed=5,
-        noise_ug_per_rthz=25.0,
+        DrivenRoad("A", 5, paths),
+        Measurement(25.0, rate_hz=500.0, has_receiver_errors=True, seed=(5, 1)),
         speed_m_per_s=(12.0, 12.0),
-        receiver_errors=True,
-        rate_hz=500.0,
-        paths=paths,
-        drive_seed=(5, 1),
     )
     sensor = site.sensor.model_copy(
         update={"noise_density_ug_per_rthz": (25.0,) * 4, "rate_hz": (500.0,) * 4}

@@ -36,7 +36,13 @@ from services.execution.offline import identify_recordings, site_of
 from services.history.validation_files import save
 from services.recordings.recording import read_messages, read_site
 from services.recordings.writer import write_recording
-from services.simulation.drive import SimulatedDrive, paper_site, simulate_drive, write_drive
+from services.simulation.drive import (
+    DrivenRoad,
+    SimulatedDrive,
+    paper_site,
+    simulate_drive,
+    write_drive,
+)
 from tests.builders.certificates import certificate
 
 SOUND_NM2 = 1.56e10
@@ -125,7 +131,7 @@ def test_scenario_12_within_one_per_cent(tmp_path: Path) -> None:
     """Damage in the last element, at the edge, where the paper's search fails."""
     truth = scenario_ratios(12)
     assert truth.min() < 0.9
-    drive = simulate_drive(paper_site(), truth, road_class="A", seed=2)
+    drive = simulate_drive(paper_site(), truth, DrivenRoad("A", 2))
     write_drive(tmp_path / "drive.mcap", drive, paper_site())
     assert ratios(only(identified(tmp_path / "drive.mcap"))) == pytest.approx(truth, rel=0.01)
 
@@ -134,7 +140,7 @@ def test_elements_are_numbered_from_the_bridges_start_also_driving_the_other_way
     tmp_path: Path,
 ) -> None:
     truth = np.array([1.0, 0.5, 1.0, 1.0, 0.9, 1.0, 1.0])
-    drive = simulate_drive(paper_site(), truth, road_class="A", seed=3, forward=False)
+    drive = simulate_drive(paper_site(), truth, DrivenRoad("A", 3), forward=False)
     write_drive(tmp_path / "drive.mcap", drive, paper_site())
     crossing = only(identified(tmp_path / "drive.mcap"))
     assert crossing.direction == "end_to_start"
@@ -148,7 +154,7 @@ def test_an_antenna_far_from_the_front_axle_and_a_changing_speed(tmp_path: Path)
     )
     site = site.model_copy(update={"vehicles": (truck,)})
     truth = scenario_ratios(6)
-    drive = simulate_drive(site, truth, road_class="A", seed=4, speed_m_per_s=(8.0, 12.0))
+    drive = simulate_drive(site, truth, DrivenRoad("A", 4), speed_m_per_s=(8.0, 12.0))
     write_drive(tmp_path / "drive.mcap", drive, site)
     crossing = only(identified(tmp_path / "drive.mcap"))
     assert "accelerating_cg_unknown" not in crossing.reasons
@@ -157,7 +163,7 @@ def test_an_antenna_far_from_the_front_axle_and_a_changing_speed(tmp_path: Path)
 
 def test_acceleration_with_unknown_centre_of_gravity_is_named(tmp_path: Path) -> None:
     drive = simulate_drive(
-        paper_site(), scenario_ratios(6), road_class="A", seed=4, speed_m_per_s=(8.0, 12.0)
+        paper_site(), scenario_ratios(6), DrivenRoad("A", 4), speed_m_per_s=(8.0, 12.0)
     )
     write_drive(tmp_path / "drive.mcap", drive, paper_site())
     assert "accelerating_cg_unknown" in only(identified(tmp_path / "drive.mcap")).reasons

@@ -16,6 +16,8 @@ from services.execution.offline import identify_recordings, site_of
 from services.simulation.command import effects_of, simulate_command
 from services.simulation.drive import (
     DepartedVehicle,
+    DrivenRoad,
+    Measurement,
     OutOfModelEffects,
     SimulatedDrive,
     beam_of,
@@ -36,7 +38,9 @@ BEFORE_S = 3.0
 def driven(beyond: OutOfModelEffects, site: Site | None = None) -> SimulatedDrive:
     known = paper_site() if site is None else site
     sound = np.ones(known.bridges[0].elements)
-    return simulate_drive(known, sound, road_class="A", seed=1, rate_hz=200.0, beyond=beyond)
+    return simulate_drive(
+        known, sound, DrivenRoad("A", 1), Measurement(rate_hz=200.0), beyond=beyond
+    )
 
 
 @pytest.fixture(scope="module")

@@ -35,6 +35,8 @@ from services.simulation.command import surface_of
 from services.simulation.drive import (
     LONGEST_STEP_S,
     SETTLE_S,
+    DrivenRoad,
+    Measurement,
     SimulatedDrive,
     paper_site,
     simulate_drive,
@@ -72,8 +74,15 @@ class Spy:
         patch.setattr(simulation, "simulate", keeping)
 
 
-def driven(**how: Any) -> SimulatedDrive:
-    return simulate_drive(SITE, np.ones(7), road_class="A", seed=3, rate_hz=RATE_HZ, **how)
+def driven(
+    paths: WheelPaths | None = None,
+    *,
+    noise: float = 0.0,
+    forward: bool = True,
+    seed: int | tuple[int, ...] | None = None,
+) -> SimulatedDrive:
+    measurement = Measurement(noise, RATE_HZ, seed=seed)
+    return simulate_drive(SITE, np.ones(7), DrivenRoad("A", 3, paths), measurement, forward=forward)
 
 
 def roads(seed: int, paths: WheelPaths, noise_seed: int, *, sign: int = 1) -> AxleRoads:
@@ -99,7 +108,7 @@ def expected_level(front: Footprint, rear: Footprint) -> float:
 def test_without_a_surface_everything_is_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bit for bit: one groove under both wheels, and the same streams of noise."""
     spy = Spy(monkeypatch)
-    drive = driven(noise_ug_per_rthz=25.0)
+    drive = driven(noise=25.0)
     (motion, felt), fine = spy.outcome[0], spy.gave[0]
     reach = SITE.vehicles[0].wheelbase_m + 1.0
     low, high = motion.position_m.min() - reach, motion.position_m.max() + reach
@@ -126,7 +135,7 @@ def test_each_axle_drives_over_the_road_that_its_tyres_feel(
     """Of one surface, whichever way it is driven; the left of the way back is the other side."""
     spy = Spy(monkeypatch)
     paths = WheelPaths(SINGLE, TWIN._replace(offset_m=0.1))
-    drive = driven(paths=paths, forward=forward)
+    drive = driven(paths, forward=forward)
     assert drive.rear_road is not None
     sign = 1 if forward else -1
     motion, felt = spy.outcome[0]
@@ -146,8 +155,8 @@ def test_each_axle_drives_over_the_road_that_its_tyres_feel(
 
 def test_the_truck_is_shaken_otherwise_by_another_rear_axle() -> None:
     """With one and the same footprint both axles feel one road; with twins the rear is calmer."""
-    alike = driven(paths=WheelPaths(SINGLE, SINGLE))
-    twins = driven(paths=WheelPaths(SINGLE, TWIN))
+    alike = driven(WheelPaths(SINGLE, SINGLE))
+    twins = driven(WheelPaths(SINGLE, TWIN))
     assert alike.rear_road is not None
     np.testing.assert_array_equal(alike.road.height_m, alike.rear_road.height_m)
     np.testing.assert_array_equal(alike.road.height_m, twins.road.height_m)
@@ -264,8 +273,8 @@ def test_several_runs_over_one_surface_are_one_recording(
 
 def test_the_first_of_several_runs_is_the_only_one_of_one(tmp_path: Path) -> None:
     """And a seed of the drive changes the noise and not the road."""
-    alone, again = driven(noise_ug_per_rthz=25.0), driven(noise_ug_per_rthz=25.0, drive_seed=3)
-    other = driven(noise_ug_per_rthz=25.0, drive_seed=(3, 1))
+    alone, again = driven(noise=25.0), driven(noise=25.0, seed=3)
+    other = driven(noise=25.0, seed=(3, 1))
     for name in CHANNELS:
         np.testing.assert_array_equal(alone.run.channels[name], again.run.channels[name])
         assert not np.array_equal(alone.run.channels[name], other.run.channels[name])
