@@ -5,8 +5,10 @@ behind it. A crossing is a stay from one side to the other; one that ends on the
 began, or with positions that only begin or end in it, cannot be identified.
 
 Where the receiver was out during a crossing, the fixes on both sides are sufficient, unless the
-truck drove away from the bridge before and towards it afterwards: it returned unobserved, or was
-switched off and started another run, and its path is unknown.
+truck's path between them is unknown: they are more than `LONGEST_UNSEEN_S` apart, or the truck
+drove away from the bridge before and towards it afterwards, because it returned unobserved, or was
+switched off and started another run. A stay with fixes on the bridge lasts at most
+`LONGEST_BRIDGED_S` beyond them.
 
 A receiver's noise moves a truck at an end of the bridge on and off it: only a passage, or a move
 further onto the bridge than noise reaches, is a stay.
@@ -32,6 +34,13 @@ MERGE_S = 5.0
 """Two entries less than this apart in s are one crossing (docs/contract.md)."""
 LONGEST_STAY_S = 270.0
 """Longest stay in s on a short bridge that counts as a crossing."""
+LONGEST_BRIDGED_S = 8.0
+"""Longest time in s over which positions are interpolated between fixes (docs/verdicts.md)."""
+LONGEST_UNSEEN_S = 30.0
+"""Longest time in s between two fixes beyond a bridge's ends that make a crossing without others.
+
+After a longer silence the truck may have detoured.
+"""
 MARGIN_M = 3.0
 """Distance in m above a usable receiver's noise between two fixes."""
 _LARGEST_SLOPE = 0.2
@@ -141,7 +150,9 @@ def find_stays(
     places = _Places(front, rear, depth, side, sense)
     stays: list[Stay] = []
     # Fixes at which the truck enters the bridge, or jumps over it because the receiver was out.
-    begins = np.flatnonzero((depth > 0.0) | (np.diff(side, prepend=side[0]) * side == 2))
+    has_jumped = np.diff(side, prepend=side[0]) * side == 2
+    has_jumped &= np.diff(time_s, prepend=time_s[0]) <= LONGEST_UNSEEN_S
+    begins = np.flatnonzero((depth > 0.0) | has_jumped)
     gone = np.append(np.flatnonzero(depth <= 0.0), time_s.size)
     stop = 0
     for n in begins.tolist():
@@ -151,7 +162,8 @@ def find_stays(
             stop = int(gone[np.searchsorted(gone, n)]) if depth[n] > 0.0 else n
             stay = _stay(time_s, places, n, stop, span_m, margin_m)
             deep_m = np.inf
-            if stay.passage is not Passage.THROUGH:
+            silence_s = np.diff(time_s[max(n - 1, 0) : stop + 1]).max()
+            if stay.passage is not Passage.THROUGH or silence_s > LONGEST_UNSEEN_S:
                 # A truck that backs away has not turned, whatever its positions: one sense for all.
                 axle = antenna_m[n:stop] + stay.direction * antenna_to_front_axle_m
                 other = axle - stay.direction * wheelbase_m
@@ -235,6 +247,9 @@ def _stay(
         # Backwards in time the truck enters the bridge over its far end.
         left = direction * (far - places.rear[around])
         exit_s = -_last_passing(-times[::-1], left[::-1], deep)
+    if start < stop:
+        entry_s = max(entry_s, float(time_s[start]) - LONGEST_BRIDGED_S)
+        exit_s = min(exit_s, float(time_s[stop - 1]) + LONGEST_BRIDGED_S)
     return Stay(passage, direction, entry_s, exit_s, is_over)
 
 

@@ -12,11 +12,9 @@ import numpy as np
 from schemas.signals import GnssFix
 from schemas.site import Vehicle
 from services.finding.bridges import Bridges
-from services.finding.stays import AxleGeometry, Floats, Stay
+from services.finding.stays import LONGEST_UNSEEN_S, AxleGeometry, Floats, Stay
 from services.finding.streams import Fixes
 
-_LONGEST_OUTAGE_S: Final = 30.0
-"""Gap in s between fixes after which a visit is another one: the truck may have detoured."""
 _MAX_TRUCKS: Final = 1000
 """Maximum number of remembered pairs of truck and bridge; the longest silent one is dropped."""
 _MAX_FIXES: Final = 2000
@@ -80,8 +78,8 @@ class Traffic:
         time_s = np.array([(t - entry_ns) * 1e-9 for t in times_ns])
         length_s = (exit_ns - entry_ns) * 1e-9
         columns = np.vstack([time_s, np.array([near[t] for t in times_ns]).T])
-        # A truck that was away in between may have detoured: that is no path over the bridge.
-        away = np.flatnonzero(np.diff(time_s) > _LONGEST_OUTAGE_S) + 1
+        # After so long a silence it is another visit.
+        away = np.flatnonzero(np.diff(time_s) > LONGEST_UNSEEN_S) + 1
         return any(
             stay.entry_s < length_s and stay.exit_s > 0.0
             for visit in np.split(columns, away, axis=1)

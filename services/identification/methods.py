@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from services.finding.crossing_data import WindowOf, close_window, wide_window
+from services.finding.stays import LONGEST_BRIDGED_S
 
-_LONGEST_OUTAGE_S = 8.0
-"""Longest time in s without a fix for which method `pre` finds the trajectory by the axles."""
 LONGEST_SURE_OUTAGE_S = 1.5
 """Longest time in s between fixes of a certain trajectory without the axles' signals."""
 
@@ -29,7 +28,7 @@ _PAPER: Final = IdentificationMethod(
 )
 METHODS: Final[Mapping[str, IdentificationMethod]] = {
     "pre": IdentificationMethod(
-        wide_window, _LONGEST_OUTAGE_S, is_general=True, has_noise_model=True
+        wide_window, LONGEST_BRIDGED_S, is_general=True, has_noise_model=True
     ),
     "least_squares": _PAPER,
     "random_walk": _PAPER,

@@ -135,6 +135,40 @@ def test_a_receiver_that_was_out_over_the_whole_bridge() -> None:
     assert stay.exit_s == pytest.approx(8.44, abs=0.01)
 
 
+@pytest.mark.parametrize("forward", [True, False])
+@pytest.mark.parametrize("hole_s", [31.0, 591.0])
+def test_no_crossing_is_assumed_in_a_long_silence(hole_s: float, *, forward: bool) -> None:
+    """Its path is unknown; within half a minute it is known."""
+    for silent_s, count in ((29.0, 1), (hole_s, 0)):
+        way = [(0.0, -200.0), (10.0, -100.0), (10.0 + silent_s, 140.0), (20.0 + silent_s, 240.0)]
+        driven = legs(*((t, x if forward else SPAN_M - x) for t, x in way))
+        kept = out(driven, 10.05, 9.95 + silent_s)
+        for noise_m in (0.0, 0.4):
+            found = stays_of(driven, kept=kept, noise_m=noise_m)
+            assert [stay.passage for stay in found] == [Passage.THROUGH] * count
+
+
+@pytest.mark.parametrize("leaves", [True, False])
+@pytest.mark.parametrize("hole_s", [60.0, 591.0])
+def test_positions_are_bridged_for_eight_seconds(hole_s: float, *, leaves: bool) -> None:
+    """Seen at 15 m, and then, or before that, far from the bridge after a silence."""
+    way = [(0.0, -85.0), (10.0, 15.0), (10.0 + hole_s, 140.0), (20.0 + hole_s, 240.0)]
+    if not leaves:
+        way = [(0.0, -200.0), (10.0, -100.0), (10.0 + hole_s, 15.0), (20.0 + hole_s, 115.0)]
+    driven = legs(*way)
+    stay = only(stays_of(driven, kept=out(driven, 10.05, 9.95 + hole_s)))
+    assert stay.passage is Passage.THROUGH
+    assert stay.exit_s - stay.entry_s < 8.0 + 3.5
+    on_it_s = 10.0 if leaves else 10.0 + hole_s
+    assert stay.entry_s <= on_it_s <= stay.exit_s
+
+
+def test_a_truck_at_the_end_of_the_bridge_is_not_on_it_in_a_silence() -> None:
+    """Its receiver's noise has put it a metre onto the bridge."""
+    driven = legs((0.0, -99.0), (10.0, 1.0), (601.0, 140.0), (611.0, 240.0))
+    assert stays_of(driven, kept=out(driven, 10.05, 600.95)) == []
+
+
 def out(driven: Drive, begin_s: float, stop_s: float) -> NDArray[np.bool_]:
     """The fixes that are left when the receiver, or the truck, was off for a while."""
     return np.asarray((driven.time_s < begin_s) | (driven.time_s >= stop_s))

@@ -9,7 +9,9 @@ from typing import cast
 
 import pytest
 
+from schemas.proto import driveby_pb2 as pb
 from schemas.results import CrossingResult
+from schemas.signals import NS_PER_S
 from schemas.topics import Key, Message
 from schemas.validation_records import VehicleBridgePair
 from services.execution.dispatch import collect, dispatch
@@ -247,9 +249,23 @@ def test_company_on_the_bridge_is_found_in_recordings(
 ) -> None:
     """A truck that the site file does not know, at the same time."""
     record(TWO)
-    theirs = [m._replace(key=m.key._replace(identifier="stranger")) for m in TWO if is_first(m)]
-    record(theirs, "stranger-20260101T000000Z.mcap")
-    worker = Worker(tmp_path)
+    record(strangers(), "stranger-20260101T000000Z.mcap")
+    assert reasons_against(Worker(tmp_path)) == [("other_truck_on_bridge",), ()]
+
+
+def test_a_silent_truck_is_no_company(tmp_path: Path, record: Callable[..., Path]) -> None:
+    """It was last seen on one side and, ten minutes later, on the other."""
+    record(TWO)
+    theirs = strangers()
+    early_ns, late_ns = theirs[0].log_time_ns + 3 * NS_PER_S, theirs[-1].log_time_ns - 3 * NS_PER_S
+    apart = [moved(m, -150 * NS_PER_S) for m in theirs if m.log_time_ns < early_ns]
+    apart += [moved(m, 450 * NS_PER_S) for m in theirs if m.log_time_ns > late_ns]
+    record(apart, "stranger-20260101T000000Z.mcap")
+    assert reasons_against(Worker(tmp_path)) == [(), ()]
+
+
+def reasons_against(worker: Worker) -> list[tuple[str, ...]]:
+    """The known faults of both crossings."""
     seen: list[tuple[str, ...]] = []
     inner = Identifications()
 
@@ -259,7 +275,21 @@ def test_company_on_the_bridge_is_found_in_recordings(
 
     worker.here = InlineExecutor(identify=identify)
     assert ids(worker.go_on()) == IDS
-    assert seen == [("other_truck_on_bridge",), ()]
+    return seen
+
+
+def strangers() -> list[Message]:
+    """Positions of another truck on its first crossing."""
+    return [m._replace(key=m.key._replace(identifier="stranger")) for m in TWO if is_first(m)]
+
+
+def moved(message: Message, by_ns: int) -> Message:
+    """A position at another time."""
+    fix = pb.GnssFix.FromString(message.payload)
+    fix.device_time_ns += by_ns + 1000 * NS_PER_S
+    fix.wall_time_ns += by_ns
+    payload = fix.SerializeToString(deterministic=True)
+    return message._replace(payload=payload, log_time_ns=message.log_time_ns + by_ns)
 
 
 def is_first(message: Message) -> bool:
