@@ -180,6 +180,31 @@ def is_held(file: BinaryIO) -> bool:
     return False
 
 
+def lock_folder(folder: Path, lock: str, in_use: str) -> int:
+    """Create a folder if it is absent and lock a file `lock` in it; return its open descriptor.
+
+    The lock ends when the descriptor is closed or its process ends, however it ends; the file
+    stays. Raise InputError, with the text `in_use` if another process has the lock.
+    """
+    check_folder_writable(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / lock
+        # The file may be another user's, of a container that shares the volume.
+        is_readable_only = path.exists() and not os.access(path, os.W_OK)
+        flags = os.O_RDONLY if is_readable_only else os.O_RDWR | os.O_CREAT
+        file = os.open(path, flags, 0o644)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made or written: {_reason(error)}") from None
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(file)
+        reason = in_use if isinstance(error, BlockingIOError) else f"{lock}: {_reason(error)}"
+        raise InputError(f"{folder}: {reason}") from None
+    return file
+
+
 def _check_replaceable(path: Path, *, force: bool) -> None:
     try:
         with path.open("rb") as file:

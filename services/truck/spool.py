@@ -13,7 +13,6 @@ that every message is always accounted for.
 """
 
 import contextlib
-import fcntl
 import json
 import logging
 import os
@@ -28,7 +27,7 @@ from typing import Any, NamedTuple
 
 from schemas.spool import PAGE_BYTES, PAGE_MESSAGES, SpoolBoot
 from services.common.errors import FailureError, InputError
-from services.common.files import check_folder_writable, write_atomically
+from services.common.files import lock_folder, write_atomically
 from services.common.intervals import Intervals
 
 DEFAULT_BUDGET_BYTES = 4 << 30
@@ -47,6 +46,7 @@ _SEGMENTS_IN_BUDGET = 16
 """Fewest files in the budget, so that freeing one drops only a small part."""
 _STATE = "state.json"
 _LOCK = "lock"
+_IN_USE = "another truck uses this spool; give every truck a folder of its own"
 _BOOTS_REMEMBERED = 100
 """Boots with remembered losses, although none of their messages is held."""
 
@@ -83,7 +83,7 @@ class Spool:
         """Bytes removed at the opening, because they were cut off or damaged."""
         self._segment_bytes = min(_LARGEST_SEGMENT_BYTES, budget_bytes // _SEGMENTS_IN_BUDGET)
         self._lock = threading.Lock()
-        self._lock_file = _locked(folder)
+        self._lock_file = lock_folder(folder, _LOCK, _IN_USE)
         with _closed_on_error(self._lock_file, folder):
             highest, self._past = _read_state(folder / _STATE)
             self._segments = []
@@ -388,23 +388,6 @@ def _read_file(path: Path, size: int) -> bytes:
             return file.read(size)
     except FileNotFoundError:  # freed in the meantime
         return b""
-
-
-def _locked(folder: Path) -> int:
-    check_folder_writable(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made or written: {error.strerror}") from None
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(file)
-        raise InputError(
-            f"{folder}: another truck uses this spool; give every truck a folder of its own"
-        ) from None
-    return file
 
 
 @contextlib.contextmanager

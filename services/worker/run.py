@@ -10,9 +10,10 @@ shown that the method recovers the truth (`validation_runner`).
 
 import contextlib
 import logging
+import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from schemas.settings import IdentificationSettings
@@ -23,7 +24,7 @@ from services.bus.playback import leave_at_once, set_by_signals, stopped_by_sign
 from services.bus.publisher import Publisher
 from services.bus.session import wait_for_router
 from services.common.errors import FailureError, InputError
-from services.common.files import check_folder_writable
+from services.common.files import check_folder_writable, lock_folder
 from services.execution.hang_watchdog import TaskLimits
 from services.execution.offline import header_of
 from services.execution.processes import ProcessExecutor
@@ -53,6 +54,11 @@ from services.worker.validation_runner import ValidationRunner
 
 _log = logging.getLogger(__name__)
 _DAY_S = 86_400.0
+_LOCK = ".worker.lock"
+_IN_USE = (
+    "another worker writes its results here; stop it first, or give this one another --realm or "
+    "--folder"
+)
 
 
 def run(asked: WorkerSettings, ready: Callable[[], None] | None = None) -> int:
@@ -62,11 +68,16 @@ def run(asked: WorkerSettings, ready: Callable[[], None] | None = None) -> int:
     Unless it has a `file` of its own or the realm is one of replays, the run resumes what earlier
     runs left there, and reads data that trucks no longer send from the logger's `recordings`. It
     waits for the router without limit. `ready` is called once, when the worker listens.
-    InputError: a bad site file, realm or id, or a method without validation. FailureError: a result
-    or a validation record cannot be written.
+    InputError: a bad site file, realm or id, a method without validation, or a folder of results
+    that another worker writes. FailureError: a result or a validation record cannot be written.
     """
     _check(asked)
     search = _search(asked)
+    with _locked_folder(asked):
+        return _run(asked, search, ready)
+
+
+def _run(asked: WorkerSettings, search: Search, ready: Callable[[], None] | None) -> int:
     file = asked.file or free_results_path(asked.folder / asked.realm)
     # A file of its own has room for one site file.
     watch = SiteFileWatcher(asked.site, search.site) if asked.file is None else None
@@ -131,6 +142,19 @@ def _check(asked: WorkerSettings) -> None:
             f"--method {method}: has no site validation, which realm live and --validate-first "
             "ask for; take pre, or --skip-validation"
         )
+
+
+@contextlib.contextmanager
+def _locked_folder(asked: WorkerSettings) -> Iterator[None]:
+    """Hold the lock of the folder of results, if the run writes there."""
+    if asked.file is not None:
+        yield
+        return
+    lock = lock_folder(asked.folder / asked.realm, _LOCK, _IN_USE)
+    try:
+        yield
+    finally:
+        os.close(lock)
 
 
 def _search(asked: WorkerSettings) -> Search:

@@ -23,6 +23,7 @@ from services.bus.publisher import Publisher
 from services.bus.session import open_session
 from services.bus.subscription import RawSample, Subscription, get_latest
 from services.common.errors import InputError
+from services.common.files import lock_folder
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, run_to_messages
 from services.recordings.recording import read_info, read_messages, read_site
@@ -359,6 +360,34 @@ def restartable(start: Start, endpoint: str, site: Path, tmp_path: Path) -> Rest
         )
 
     return Restartable(begin, folder)
+
+
+def test_one_worker_at_a_time_writes_a_folder(
+    restartable: Restartable, site: Path, endpoint: str
+) -> None:
+    """Whatever its name on the bus; a killed one is in nobody's way, nor one of another realm."""
+    first = restartable.begin()
+    assert first.stderr is not None
+    assert any("no router answers" in line for line in first.stderr)
+    here = WorkerSettings(
+        endpoint=endpoint,
+        realm=REALM,
+        site=site,
+        folder=restartable.folder,
+        method="least_squares",
+        service_id="another",
+    )
+    with pytest.raises(InputError) as refused:
+        run_worker(here)
+    where = restartable.folder / REALM
+    assert str(refused.value).startswith(f"{where}: another worker writes its results here; ")
+    assert "\n" not in str(refused.value)
+    os.close(lock_folder(restartable.folder / "sim-other", ".worker.lock", "in use"))
+    kill(first)
+    second = restartable.begin()
+    assert second.stderr is not None
+    assert any("no router answers" in line for line in second.stderr)
+    kill(second)
 
 
 WHOLE = ["crossing"] * 3 + ["estimate", "crossing", "state"]

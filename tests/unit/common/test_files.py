@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from services.common.errors import FailureError, InputError
 from services.common.files import (
     check_writable,
+    lock_folder,
     make_folder,
     read_bytes,
     read_text,
@@ -110,3 +112,32 @@ def test_unreadable_files_are_named(tmp_path: Path) -> None:
     path.write_bytes(b"a\nb\n\xfc\n")
     with pytest.raises(InputError, match=r"latin\.csv: line 3: is not UTF-8"):
         read_text(path)
+
+
+def test_a_folder_is_locked_by_one_at_a_time(tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "folder"
+    lock = lock_folder(folder, "lock", "somebody is here")
+    with pytest.raises(InputError, match=f"^{re.escape(str(folder))}: somebody is here$"):
+        lock_folder(folder, "lock", "somebody is here")
+    os.close(lock)
+    os.close(lock_folder(folder, "lock", "somebody is here"))
+
+
+def test_a_lock_of_another_user_is_taken_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a container that shares the volume."""
+    os.close(lock_folder(tmp_path, "lock", "somebody is here"))
+    access, opened = os.access, os.open
+
+    def refuse(path: Path, flags: int, mode: int = 0o777) -> int:
+        if flags & os.O_RDWR:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return opened(path, flags, mode)
+
+    monkeypatch.setattr(os, "access", lambda path, mode: path.name != "lock" and access(path, mode))
+    monkeypatch.setattr(os, "open", refuse)
+    first = lock_folder(tmp_path, "lock", "somebody is here")
+    with pytest.raises(InputError, match="somebody is here"):
+        lock_folder(tmp_path, "lock", "somebody is here")
+    os.close(first)
