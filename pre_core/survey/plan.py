@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import isotonic_regression
 
 from pre_core.crossing import posterior
 from pre_core.crossing.compliances import draws, from_normal, marginal
@@ -191,5 +190,7 @@ def non_increasing(spreads: FloatArray) -> FloatArray:
     More crossings never widen a posterior: an increase between two rows is an error of a standard
     deviation from a finite number of draws.
     """
+    from scipy.optimize import isotonic_regression  # slow to import, of plans alone
+
     columns = [isotonic_regression(column, increasing=False).x for column in spreads.T]
     return np.stack(columns, axis=1)

@@ -17,7 +17,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from services.simulation.two_sided_deck import Deck, exact_modes
@@ -407,6 +406,8 @@ def _under_tyres(
     road: WideRoad, tyres: WideTyres, places: Floats, motion: WideMotion, settle_s: float
 ) -> tuple[Floats, Floats]:
     """Return heights and their rates of change (half steps, tyres)."""
+    from scipy.interpolate import CubicSpline  # slow to import, of deviating crossings alone
+
     stop = road.start_m + road.spacing_m * (road.height_m.shape[1] - 1)
     if places.min() < road.start_m or places.max() > stop:
         raise ValueError(

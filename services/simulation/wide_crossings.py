@@ -16,7 +16,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from pre_core.constants import MICRO_G_M_PER_S2
 from schemas.site import Bridge, Site
@@ -229,6 +228,8 @@ def _measured(
     rate_hz: float,
     rng: np.random.Generator,
 ) -> Floats:
+    from scipy.interpolate import CubicSpline  # slow to import, of deviating crossings alone
+
     true = response.acceleration @ sensor_row(truck, sensor)
     read = CubicSpline(response.time_s, true)(time_s - sensor.delay_s)
     noise = sensor.noise_ug_per_rthz * MICRO_G_M_PER_S2 * np.sqrt(rate_hz / 2.0)

@@ -214,6 +214,25 @@ def test_a_long_module_says_why_it_is_one(modules: list[Module]) -> None:
 HEAVY = ("numba", "zenoh", "rerun", "matplotlib", "scipy", "pydantic", "numpy", "pandas", "xarray")
 
 
+SELDOM_NEEDED = ("interpolate", "optimize", "signal", "stats")
+"""Parts of SciPy that take as long to import as a fifth of a worker's start."""
+
+
+def test_seldom_needed_parts_of_scipy_are_imported_where_they_are_used(
+    modules: list[Module],
+) -> None:
+    at_once = {
+        (module.name, node.module)
+        for module in modules
+        if not module.name.startswith("studies.")
+        for node in module.tree.body
+        if isinstance(node, ast.ImportFrom) and node.module
+    }
+    assert {module for _, module in at_once} > {"scipy.linalg", "scipy.special"}
+    names = {f"scipy.{part}" for part in SELDOM_NEEDED}
+    assert [one for one in sorted(at_once) if one[1] in names] == []
+
+
 def printed(code: str) -> str:
     """Run code in a process of its own; return the last line it prints."""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
