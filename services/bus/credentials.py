@@ -126,6 +126,17 @@ def read_certificate(path: Path) -> x509.Certificate:
         raise InputError(f"{path}: is no certificate in PEM form") from None
 
 
+def hosts_of(certificate: x509.Certificate) -> list[str]:
+    """Return the names and addresses of hosts in a certificate; none without the extension."""
+    try:
+        found = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName)
+    except x509.ExtensionNotFound:
+        return []
+    return [
+        str(one.value) for one in found.value if not isinstance(one, x509.UniformResourceIdentifier)
+    ]
+
+
 def link_settings(folder: Path | str) -> dict[str, Any]:
     """Return Zenoh's settings for mutual TLS, and TLS only, with a folder's credentials.
 

@@ -26,6 +26,7 @@ import re
 import socket
 import time
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from services.bus.credentials import (
     check_credentials,
     link_settings,
 )
+from services.bus.tls_probe import cause_of_failure
 from services.common.endpoints import default_endpoint
 from services.common.errors import FailureError, InputError
 from services.common.files import read_bytes
@@ -54,6 +56,8 @@ _CONNECT_S = 1.0
 _PATIENCE_WITH_SUBSCRIBER_US = 1_000_000
 """Timeout of a blocked subscriber. Zenoh's default is 5 s; a subscriber that is cut off connects
 again and fetches missing messages."""
+_CAUSE_S = 60.0
+"""Interval of probes for the cause of a failure, each of which delays Zenoh's next handshake."""
 _RUNTIME = "(rx: (handover: acc), acc: (worker_threads: 2))"
 """Threads of a router: the waiting threads also read. Waking Zenoh's own pool of receiving threads
 for every message costs more than handling it. There are two, because new connections need one too
@@ -116,25 +120,33 @@ def wait_for_router(
 
     Raise InputError for a malformed endpoint or bad credentials.
     """
-    is_logged = False
+    logged = ""
     while not is_over():
         # Zenoh itself would wait for ever, and Python would handle no signal.
         try:
             return open_session(connect=endpoint, timeout_s=_CONNECT_S, tls=tls)
         except FailureError as error:
-            if not is_logged:
+            if str(error) != logged:  # the cause may change, from no router to a wrong certificate
                 _log.warning("%s; retrying", error)
-            is_logged = True
+            logged = str(error)
     return None
 
 
 def _why_not_connected(endpoint: str, timeout_s: float | None, tls: Path | None) -> str:
-    refused = "" if tls is None else ", or the one there refuses or does not prove a certificate"
     within = f" within {timeout_s:g} s" if timeout_s else ""
+    cause = _cause(endpoint, tls, int(time.monotonic() // _CAUSE_S))
+    if cause is not None:
+        return f"no router answers at {endpoint}{within}: {cause}"
     return (
-        f"no router answers at {endpoint}{within}{refused}; "
+        f"no router answers at {endpoint}{within}; "
         "start `driveby logger` first or give another endpoint"
     )
+
+
+@lru_cache(maxsize=16)
+def _cause(endpoint: str, tls: Path | None, _period: int) -> str | None:
+    """Return the cause of a failure, once a period: services attempt a connection every second."""
+    return cause_of_failure(endpoint, tls)
 
 
 def _why_not_listening(endpoint: str, error: zenoh.ZError) -> str:
@@ -181,6 +193,12 @@ def _add_security(config: zenoh.Config, tls: Path, *, is_client: bool) -> None:
     if subject.role not in LISTENERS:
         raise InputError(f"{tls}: is the certificate of {subject}; only a logger's may listen")
     config.insert_json5("access_control", json.dumps(_access_control(tls)))
+
+
+def listed_participants(tls: Path) -> frozenset[str]:
+    """Return the common names that the access control of a listener's folder admits."""
+    subjects = _access_control(tls)["subjects"]
+    return frozenset(name for one in subjects for name in one.get("cert_common_names") or ())
 
 
 def _access_control(tls: Path) -> dict[str, Any]:

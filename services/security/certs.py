@@ -49,6 +49,7 @@ from services.bus.credentials import (
     KEY,
     LISTENERS,
     Subject,
+    hosts_of,
     link_settings,
     parse_subject,
     read_certificate,
@@ -277,7 +278,7 @@ def _issue(
     listens = subject.role in LISTENERS
     copy = authority.folder / _ISSUED / f"{subject.name}.pem"
     if listens:
-        before = _hosts_of(read_certificate(copy)) if copy.exists() else LOCAL_HOSTS
+        before = hosts_of(read_certificate(copy)) if copy.exists() else LOCAL_HOSTS
         hosts = tuple(dict.fromkeys([*before, *hosts]))
     key = ec.generate_private_key(ec.SECP256R1())
     now = datetime.now(UTC)
@@ -348,16 +349,11 @@ def _alternative_names(subject: Subject, hosts: Sequence[str]) -> x509.SubjectAl
     )
 
 
-def _hosts_of(certificate: x509.Certificate) -> list[str]:
-    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    return [str(one.value) for one in names if not isinstance(one, x509.UniformResourceIdentifier)]
-
-
 def _router_host(authority: _Authority) -> str:
     """Return the router's likely address: the first host other than this machine's own name."""
     for name in ("router", "logger"):
         certificate = authority.issued().get(name)
-        hosts = [] if certificate is None else _hosts_of(certificate)
+        hosts = [] if certificate is None else hosts_of(certificate)
         for host in hosts:
             if host not in LOCAL_HOSTS:
                 return f"[{host}]" if ":" in host else host

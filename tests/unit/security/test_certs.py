@@ -24,6 +24,7 @@ from services.bus.credentials import (
     Subject,
     check_credentials,
     check_speaks_for,
+    hosts_of,
     read_certificate,
 )
 from services.bus.session import open_session
@@ -180,7 +181,7 @@ def test_renewal_replaces_one_key_and_keeps_the_hosts(folder: Path) -> None:
         folder / "logger" / CERTIFICATE,
         folder / "authority" / "issued" / "logger.pem",
     }
-    assert certs._hosts_of(read_certificate(folder / "logger" / CERTIFICATE)) == [
+    assert hosts_of(read_certificate(folder / "logger" / CERTIFICATE)) == [
         *certs.LOCAL_HOSTS,
         *("logger.example.org", "10.0.0.5", "other.example.org"),
     ]
