@@ -97,10 +97,13 @@ def declare_and_wait(publisher: Publisher, keys: Iterable[Key], timeout_s: float
     return found
 
 
-def confirm(delivery: DeliveryTracker, sent: int) -> None:
+def confirm(
+    delivery: DeliveryTracker, sent: int, complaint: Callable[[], str | None] = lambda: None
+) -> None:
     """Wait until a logger has everything on disk; raise FailureError if it fails.
 
-    Without a logger this only gives the subscribers time to fetch missing messages.
+    Without a logger this only gives the subscribers time to fetch missing messages; `complaint`
+    returns why there are none, which is a failure too, or None.
     """
     missing = delivery.wait(DELIVERY_TIMEOUT_S)
     if missing and delivery.has_logger:
@@ -108,6 +111,8 @@ def confirm(delivery: DeliveryTracker, sent: int) -> None:
             f"only {sent - missing} of {sent} messages were confirmed by the logger within "
             f"{DELIVERY_TIMEOUT_S:.0f} s"
         )
+    if missing and (why := complaint()) is not None:
+        raise FailureError(f"none of {sent} messages was received: {why}")
     if missing:
         _log.warning("no logger in realm %s: delivery was not confirmed", delivery.realm)
 

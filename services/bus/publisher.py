@@ -101,7 +101,7 @@ class Publisher:
         probe = self._session.declare_publisher(key(self.realm, owner, identifier, stream))
         try:
             deadline = time.monotonic() + timeout_s
-            while not _matches(probe):
+            while not is_matched(probe):
                 if time.monotonic() >= deadline:
                     return False
                 time.sleep(_POLL_S)
@@ -177,7 +177,8 @@ def _declare_publisher(session: zenoh.Session, where: str) -> ext.AdvancedPublis
     )
 
 
-def _matches(publisher: zenoh.Publisher) -> bool:
+def is_matched(publisher: zenoh.Publisher) -> bool:
+    """Return whether anything subscribes to the key of a publisher."""
     # An object with a flag, which is always true itself; the type stubs call it a bool.
     status: Any = publisher.matching_status
     return bool(getattr(status, "matching", status))

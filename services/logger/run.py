@@ -45,6 +45,7 @@ from services.logger.memory import give_back_memory
 from services.logger.own_events import OwnEvents
 from services.logger.rate_limited_log import RateLimitedLog
 from services.logger.settings import LoggerSettings
+from services.logger.unlisted import UnlistedLog
 from services.logger.writer import FileWriter, RotationLimits, count_all
 
 _log = logging.getLogger(__name__)
@@ -95,7 +96,7 @@ def run(asked: LoggerSettings, ready: Callable[[], None] | None = None) -> int:
         writer = FileWriter(place, limits, own=own)
         try:
             intake = Intake(place.realm, asked.service_id, own.boot_id)
-            logger = _Logger(place, realms, asked.service_id, writer, intake, own)
+            logger = _Logger(place, realms, asked.service_id, writer, intake, own, asked.tls)
             with _rotated_by_signal(writer):
                 gone = _record(logger, bus, stop, ready, asked.budget_bytes)
         except BaseException:
@@ -130,6 +131,7 @@ class _Logger(NamedTuple):
     writer: FileWriter
     intake: Intake
     own: OwnEvents
+    tls: Path | None
 
 
 def _record(
@@ -261,6 +263,7 @@ class _Announcements:
         self._drops: dict[tuple[str, str], Drop] = {}
         self._drops_reported_s: dict[tuple[str, str], float] = {}
         self._complaints = RateLimitedLog(_log, _EVENTS_LOGGED)
+        self._unlisted = UnlistedLog(bus, logger.tls)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="announce", daemon=True)
         self._thread.start()
@@ -307,6 +310,7 @@ class _Announcements:
         time.sleep(_GOODBYE_S)  # a put only hands over; leave the connection time to send
         for publisher in self._publishers.values():
             publisher.close()
+        self._unlisted.close()
         self._complaints.flush(closing=True)
 
     def _run(self) -> None:
@@ -317,6 +321,7 @@ class _Announcements:
             closing = self._closing.wait(_ANNOUNCE_PERIOD_S)
             self._publish_events()
             self._complaints.flush()
+            self._unlisted.look()
             is_due = closing or time.monotonic() >= next_durable_s
             if is_due and self._logger.writer.durable_version() != version:
                 next_durable_s = time.monotonic() + _DURABLE_PERIOD_S
@@ -365,7 +370,7 @@ class _Announcements:
             service=self._logger.service_id,
             ok=writer.failure is None and not writer.dropped and not writer.room.is_low,
             figures={name: float(value) for name, value in figures.items()},
-            note=writer.failure or "",
+            note=writer.failure or self._unlisted.note,
         )
         realm = self._logger.place.realm or "live"
         payload = message.SerializeToString(deterministic=True)

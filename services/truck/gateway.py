@@ -54,6 +54,7 @@ from schemas.spool import (
 from schemas.topics import Key, check_identifier, check_realm, gateway_service, key, topic
 from schemas.vehicle_info import vehicle_part
 from services.bus.delivery import DeliveryTracker
+from services.bus.participants import SubscriberCheck
 from services.bus.publisher import Publisher
 from services.common.errors import FailureError
 from services.common.log_lines import about
@@ -72,11 +73,12 @@ _GOODBYE_S = 5.0
 _QUERIES_WAITING = 100
 """Capacity for queries of the spool: a few loggers, each every two seconds."""
 _COMPLAINT_PERIOD_S = 60.0
-"""Interval of log lines about a failing disk, which fails at every message."""
+"""Interval of log lines about a failing disk, which fails at every message, or no subscriber."""
 _CONNECT_PAUSE_S = 0.2
 """Pause between two attempts, each of which may fail at once."""
 _FIRST_ANSWER_S = 1.0
 """Wait for the first attempt; the truck then records while it goes on."""
+_KEPT = "the spool keeps the messages"
 _MEANWHILE = "all messages go to the spool meanwhile"
 Connect = Callable[[], zenoh.Session]
 """Open a session; raise FailureError if there is no answer now."""
@@ -113,6 +115,8 @@ class Gateway:
         """Whether there is a session; once there is one, it connects again by itself."""
         self._next: Counter[str] = Counter()
         self._complained_s = float("-inf")
+        self._unsubscribed_s = float("-inf")
+        self._subscribers: SubscriberCheck | None = None
         self._alive: Any = None
         self._own_session: zenoh.Session | None = None
         self._spool = None if spool is None else _SpoolService(self, spool)
@@ -203,6 +207,23 @@ class Gateway:
         self._next[stream] = identity.sequence + 1
         self.delivery.sent(Key(self.publisher.realm, "vehicle", self.vehicle, stream), identity)
 
+    def subscriber_complaint(self) -> str | None:
+        """Return why nothing receives this truck, and that a spool keeps its messages, or None."""
+        if self._subscribers is None or self.delivery.has_logger:
+            return None
+        why = self._subscribers.complaint()
+        return why if why is None or self._spool is None else f"{why}; {_KEPT}"
+
+    def warn_without_subscriber(self) -> None:
+        """Log why nothing receives this truck, if nothing does, at most once a minute."""
+        now_s = time.monotonic()
+        if now_s < self._unsubscribed_s + _COMPLAINT_PERIOD_S:
+            return
+        why = self.subscriber_complaint()
+        if why is not None:
+            self._unsubscribed_s = now_s
+            self.log.warning("%s", why)
+
     def close(self) -> None:
         """Leave the bus. The next boot offers spooled messages that no logger has on disk."""
         self._closing.set()
@@ -212,21 +233,25 @@ class Gateway:
             self._alive.undeclare()
         if self._spool is not None:
             self._spool.close()
+        if self._subscribers is not None:
+            self._subscribers.close()
         self.delivery.close()
         self.publisher.close()
         if self._own_session is not None:
             self._own_session.close()  # type: ignore[no-untyped-call]
 
     def _connect(self, connect: Connect) -> None:
+        logged = ""
         while not self._closing.is_set():
             is_late = self._answered.is_set()
             try:
                 self._own_session = connect()
                 self._join(self._own_session)
             except FailureError as error:
-                if not is_late:
+                if str(error) != logged:  # from no router to a wrong certificate, for instance
                     self.log.warning("%s: %s; %s", self.vehicle, error, _MEANWHILE)
-                    self._answered.set()
+                logged = str(error)
+                self._answered.set()
                 self._closing.wait(_CONNECT_PAUSE_S)
             except Exception as error:
                 if is_late:  # an unattended truck continues without this thread
@@ -246,6 +271,8 @@ class Gateway:
         # Present while this process runs: services notice trucks by it.
         alive = key(self.publisher.realm, "vehicle", self.vehicle, "alive")
         self._alive = session.liveliness().declare_token(alive)
+        where = Key(self.publisher.realm, "vehicle", self.vehicle, "accel")
+        self._subscribers = SubscriberCheck(session, where)
         self.is_online = True
         if self._spool is not None:
             self._spool.join(session)
@@ -351,6 +378,7 @@ class _SpoolService:
                 self._gateway.log.error("%s: spool: %s", self._gateway.vehicle, error)
             if rounds % _FREE_EVERY == 0:
                 self._free()
+                self._gateway.warn_without_subscriber()
 
     def _free(self) -> None:
         try:

@@ -73,7 +73,8 @@ def run(asked: GatewaySettings, ready: Callable[[], None] = lambda: None) -> int
     subscribed to.
 
     Raise InputError for bad arguments, or a site file without the truck's `[ros2]`; FailureError if
-    a router does not answer in time, or a logger did not confirm everything at the end.
+    a router does not answer in time, nothing subscribes until the end, or a logger did not confirm
+    everything then.
     """
     check_rosbags()
     realm, endpoint, tls = asked.realm, asked.address, asked.tls
@@ -106,7 +107,7 @@ def run(asked: GatewaySettings, ready: Callable[[], None] = lambda: None) -> int
         for item in truck.finish():
             out.put(item)
         reports.report(closing=True)
-        confirm(gateway.delivery, out.sent)
+        confirm(gateway.delivery, out.sent, gateway.subscriber_complaint)
         gateway.log.info("%d messages of %s published in realm %s", out.sent, vehicle, realm)
     return 0
 

@@ -70,7 +70,8 @@ def run(asked: TruckSettings, *, connect_timeout_s: float | None = CONNECT_TIMEO
 
     Raise InputError if the recording is missing, invalid or without that vehicle, or the spool is
     another truck's; FailureError if the endpoint does not answer within `connect_timeout_s` (None:
-    wait for ever; irrelevant with a spool), or the logger did not confirm everything.
+    wait for ever; irrelevant with a spool), nothing subscribes until the end (a spool keeps the
+    messages), or the logger did not confirm everything.
     """
     check_speed(asked.speed)
     realm = _checked_realm(asked.realm)
@@ -95,9 +96,9 @@ def run(asked: TruckSettings, *, connect_timeout_s: float | None = CONNECT_TIMEO
             gateway.publisher, keys, SUBSCRIBER_TIMEOUT_S
         ):
             # A real truck continues as well; its cache serves late subscribers.
-            gateway.log.warning("no subscriber to %s in realm %s yet", gateway.vehicle, realm)
+            gateway.warn_without_subscriber()
         sent = _publish(gateway, messages, asked, stop)
-        confirm(gateway.delivery, sent)
+        confirm(gateway.delivery, sent, gateway.subscriber_complaint)
         if gateway.is_online:
             gateway.log.info(
                 "%d messages of %s published in realm %s", sent, gateway.vehicle, realm

@@ -1,6 +1,7 @@
 """Services as processes of the command line, each with its own certificate."""
 
 import contextlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,6 +21,8 @@ from services.bus.session import open_session
 from services.bus.subscription import Subscription
 from services.common.errors import InputError
 from services.recordings.recording import read_messages, read_site
+from services.security.certs import certs_command
+from services.security.settings import CertsSettings
 from services.truck.gateway import Gateway
 from services.truck.spool import Spool
 from tests.builders.commands import run
@@ -93,6 +96,50 @@ def test_everything_is_recorded_under_access_control(
     assert {key.realm for key, _, _ in found} == {"live", "replay-x"}
     for key in credentials.glob("*/key.pem"):
         assert key.read_text().splitlines()[1] not in log
+
+
+def test_unlisted_truck_fails_named_and_its_spool_keeps_everything(
+    driveby: Driveby, credentials: Path, tls_endpoint: str, recording: Path, tmp_path: Path
+) -> None:
+    """The list of the logger lacks the truck at first; its own credentials are valid."""
+    lacking = tmp_path / "lacking"
+    shutil.copytree(credentials, lacking)
+    certs_command(CertsSettings(folder=lacking, revoke=["truck-1"]))
+
+    def logger(listener: Path) -> subprocess.Popen[str]:
+        return driveby(
+            *("logger", "--listen", tls_endpoint, "--tls", listener, "--folder", tmp_path / "r")
+        )
+
+    def end(process: subprocess.Popen[str]) -> str:
+        process.send_signal(signal.SIGTERM)
+        _, log = process.communicate(timeout=LONGEST_S)
+        assert process.returncode == 0, log
+        return log
+
+    first = logger(lacking / "logger")
+    truck = driveby(
+        *("truck", recording, "--speed", 50, "--spool", tmp_path / "spool"),
+        *("--endpoint", tls_endpoint, "--tls", credentials / "truck-1"),
+    )
+    _, log = truck.communicate(timeout=LONGEST_S)
+    assert truck.returncode == 1
+    assert log.splitlines()[-1] == (
+        "driveby: none of 401 messages was received: nothing at logger/logger subscribes to "
+        "truck-1: its list of participants lacks this certificate, see docs/security.md#changes; "
+        "the spool keeps the messages"
+    )
+    where = lacking / "logger" / "zenoh.json5"
+    assert end(first).count(f"truck/truck-1 is connected and not listed in {where}") == 1
+    assert not identities(tmp_path / "r")
+    second = logger(credentials / "logger")
+    with open_session(
+        connect=tls_endpoint, timeout_s=LONGEST_S, tls=credentials / "truck-1"
+    ) as session:
+        gateway = Gateway(session, "live", "truck-1", Spool(tmp_path / "spool"))
+        until(lambda: len(set(identities(tmp_path / "r"))) == 401, "the first drive")
+        gateway.close()
+    assert "not listed" not in end(second)
 
 
 def test_a_crossing_is_identified_under_access_control(
