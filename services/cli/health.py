@@ -17,6 +17,8 @@ from services.common.errors import FailureError, InputError
 
 OLDEST_S = 150.0
 """Largest age of a healthy service's message in s, two and a half periods."""
+_AHEAD_S = 2.0
+"""Time in s by which a message lies in the future when a clock is wrong."""
 _ANSWER_S = 5.0
 """Longest wait for the answer in s; a healthy service answers from memory."""
 
@@ -49,8 +51,10 @@ def health_command(
         raise FailureError(
             f"{service} in realm {realm} is not well: {latest.note or 'see its log'}"
         )
-    note = f"; {latest.note}" if latest.note else ""
-    return f"{service} in realm {realm} is well, {max(age_s, 0.0):.0f} s ago{note}"
+    notes = [latest.note] if latest.note else []
+    if age_s < -_AHEAD_S:
+        notes.append(f"its clock is {-age_s:.0f} s ahead of this machine's")
+    return "; ".join([f"{service} in realm {realm} is well, {max(age_s, 0.0):.0f} s ago", *notes])
 
 
 def _latest(subscription: Subscription, patience_s: float) -> pb.Health | None:

@@ -27,6 +27,8 @@ _STEP: Final = 0.2
 """Step of a bar in EI over nominal: all values within a tenth of 1 have equal height."""
 _WIDE: Final = 110
 """Columns from which intervals and reasons fit next to each other."""
+_AHEAD_S: Final = 0.5
+"""Time in s by which samples lie in the future when a clock is wrong."""
 _OLD_S: Final = 60.0
 """Age in s at arrival from which samples are old."""
 _LATE_S: Final = 150.0
@@ -75,7 +77,7 @@ def page(
         parts.append(Text(hint or "No trucks yet.", style="yellow" if hint else "dim"))
     if trucks:
         parts.append(_trucks(trucks[:most_trucks], listening, now_s))
-        parts += _late_sample_notes(trucks, listening.realm)
+        parts += _wrong_time_notes(trucks, listening.realm)
         if len(trucks) > most_trucks:
             parts.append(Text(f"  and {len(trucks) - most_trucks} more", style="dim"))
     if rows:
@@ -153,17 +155,32 @@ def _trucks(trucks: Sequence[tuple[str, TruckRow]], listening: ListenerView, now
 
 
 def _lag(seconds: float) -> Text:
-    return Text(_length(seconds), style="yellow" if seconds > _OLD_S else "")
+    if seconds < -_AHEAD_S:
+        return Text(f"{_length(-seconds)} ahead", style="yellow")
+    return Text(_length(max(seconds, 0.0)), style="yellow" if seconds > _OLD_S else "")
 
 
-def _late_sample_notes(trucks: Sequence[tuple[str, TruckRow]], realm: str) -> list[Text]:
-    """Return lines on why samples are old at their arrival, if they are."""
-    old = [name for name, truck in trucks if truck.lag_s > _OLD_S]
-    if not old or is_from_recording(realm):
+def _wrong_time_notes(trucks: Sequence[tuple[str, TruckRow]], realm: str) -> list[Text]:
+    """Return lines on why samples are old or in the future at their arrival, if they are."""
+    if is_from_recording(realm):
         return []
-    why = "replayed faster than real time, sent late, or a clock is wrong"
-    said = f"  {', '.join(old[:3])}: samples are old on arrival: {why}"
-    return [Text(said, style="yellow", no_wrap=True, overflow="ellipsis")]
+    old = [name for name, truck in trucks if truck.lag_s > _OLD_S]
+    ahead = [name for name, truck in trucks if truck.lag_s < -_AHEAD_S]
+    why = "samples are old on arrival: replayed faster than real time, sent late, or a clock is "
+    notes = [
+        (old, f"{why}wrong"),
+        (ahead, "samples are from the future: the clock of the truck or of this machine is wrong"),
+    ]
+    return [
+        Text(
+            f"  {', '.join(names[:3])}: {text}",
+            style="yellow",
+            no_wrap=True,
+            overflow="ellipsis",
+        )
+        for names, text in notes
+        if names
+    ]
 
 
 def _crossings(rows: Sequence[CrossingRow], *, is_wide: bool) -> Table:

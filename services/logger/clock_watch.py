@@ -96,7 +96,7 @@ class ClockWatch:
             drift = clock.due(now_s)
             if drift is not None:
                 ppm = "" if drift.drift_ppm is None else f", {drift.drift_ppm:+.1f} ppm"
-                text = f"the truck's clock is {drift.offset_s:.3f} s behind the logger's{ppm}"
+                text = f"the truck's clock is {drift}{ppm}"
                 event = Event(
                     EventKind.CLOCK_DRIFT, now_ns, text, vehicle=vehicle, boot_id=clock.boot_id
                 )

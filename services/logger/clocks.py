@@ -33,9 +33,14 @@ class ClockDrift(NamedTuple):
     """Offset and drift of a truck's wall clock against the logger's."""
 
     offset_s: float
-    """Lag of the truck behind the logger, plus the shortest delay."""
+    """Lag of the truck behind the logger, plus the shortest delay; negative: it is ahead."""
     drift_ppm: float | None
     """Rate by which the truck's clock is slow; None within the first three minutes."""
+
+    def __str__(self) -> str:
+        """Return how far the truck's clock is behind or ahead."""
+        direction = "ahead of" if self.offset_s < 0.0 else "behind"
+        return f"{abs(self.offset_s):.3f} s {direction} the logger's"
 
 
 def clock_step_ns(before_ns: int | None, offset_ns: int) -> int:
@@ -59,6 +64,7 @@ class TruckClock:
     _drift: ClockDrift | None = None
     """Fit over complete minutes, computed once a minute and requested every second."""
     _reported: tuple[float, float] | None = None
+    _is_stepped: bool = False
 
     def wall_against_device(self, wall_ns: int, device_ns: int) -> int:
         """Note a message's two times, in order of sequence; return the step in ns or 0."""
@@ -84,8 +90,15 @@ class TruckClock:
             self._smallest = (arrival_ns, delay_ns)
 
     def drift(self) -> ClockDrift | None:
-        """Return offset and drift over the last hour; None in the first minute."""
-        return self._drift
+        """Return offset and drift over the last hour; None in the first minute.
+
+        A clock that is ahead from the start is known at once: no delay makes a message come early.
+        After a step, which has an event of its own, the minute is waited for.
+        """
+        if self._drift is not None or self._is_stepped or self._smallest is None:
+            return self._drift
+        delay_ns = self._smallest[1]
+        return ClockDrift(delay_ns * 1e-9, None) if delay_ns <= -STEP_NS else None
 
     def due(self, now_s: float) -> ClockDrift | None:
         """Return the drift if it should be recorded: first, and when it has moved by 50 ms.
@@ -115,6 +128,7 @@ class TruckClock:
 
     def forget(self) -> None:
         """Restart the envelope after a step of either clock."""
+        self._is_stepped = True
         self._minutes.clear()
         self._drift = None
         self._smallest = None

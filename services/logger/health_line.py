@@ -3,6 +3,10 @@
 from collections import defaultdict
 from collections.abc import Mapping
 
+from schemas.signals import NS_PER_S
+from services.logger.clocks import STEP_NS
+
+_MAX_NAMED = 3
 _LONG_LAG_S = 60.0
 """Shortest lag that is explained: the network is rarely the cause."""
 
@@ -21,3 +25,16 @@ def health_line(figures: Mapping[str, float]) -> str:
         f"dropped {known['dropped']:.0f}, written {known['written']:.0f} to "
         f"{known['files']:.0f} files, {known['disk_free_bytes'] / 1e9:.1f} GB left"
     )
+
+
+def clock_note(figures: Mapping[str, float]) -> str:
+    """Return the trucks whose clocks are ahead of the logger's, for `health`; empty without any."""
+    name = "clock_offset_s/"
+    ahead = {
+        truck.removeprefix(name): -offset_s
+        for truck, offset_s in sorted(figures.items())
+        if truck.startswith(name) and offset_s * NS_PER_S <= -STEP_NS
+    }
+    shown = [f"{truck} by {by_s:.1f} s" for truck, by_s in list(ahead.items())[:_MAX_NAMED]]
+    more = " …" if len(ahead) > _MAX_NAMED else ""
+    return f"clocks ahead: {', '.join(shown)}{more}" if shown else ""

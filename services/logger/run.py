@@ -38,7 +38,7 @@ from services.common.log_lines import about
 from services.logger.completeness import Completeness
 from services.logger.drops import QUEUE_IS_FULL, Drop
 from services.logger.file_layout import RecordingTarget
-from services.logger.health_line import health_line
+from services.logger.health_line import clock_note, health_line
 from services.logger.housekeeping import Housekeeping, RetentionPolicy
 from services.logger.intake import Intake
 from services.logger.memory import give_back_memory
@@ -364,13 +364,14 @@ class _Announcements:
         if writer.room.free_bytes is not None:
             figures["disk_free_bytes"] = writer.room.free_bytes
         figures |= self._completeness.figures()
+        notes = (writer.failure or "", self._unlisted.note, clock_note(figures))
         message = pb.Health(
             schema_version=1,
             time_ns=time.time_ns(),
             service=self._logger.service_id,
             ok=writer.failure is None and not writer.dropped and not writer.room.is_low,
             figures={name: float(value) for name, value in figures.items()},
-            note=writer.failure or self._unlisted.note,
+            note="; ".join(note for note in notes if note),
         )
         realm = self._logger.place.realm or "live"
         payload = message.SerializeToString(deterministic=True)

@@ -152,6 +152,19 @@ def test_old_samples_are_explained() -> None:
     assert not any("samples are old" in one for one in replayed)
 
 
+def test_samples_from_the_future_are_explained() -> None:
+    watched = RealmModel()
+    drives(watched, "truck-1", lag_s=-3599.0)
+    lines = drawn(watched)
+    assert line(lines, "truck-1").endswith("60 min ahead")
+    assert any(
+        "truck-1: samples are from the future: the clock of the truck or of this machine is wrong"
+        in one
+        for one in lines
+    )
+    assert not any("future" in one for one in drawn(watched, listened=Listened("replay-monday")))
+
+
 def test_an_empty_realm_names_the_others() -> None:
     listened = Listened()
     assert any("No trucks yet." in one for one in drawn(RealmModel(), listened=listened))

@@ -160,6 +160,26 @@ def test_drift_is_reported_when_known_and_when_changed() -> None:
     assert figures["clock_drift_ppm/truck-1"] == pytest.approx(100.0, abs=1.0)
 
 
+def test_clock_that_is_ahead_is_reported_at_the_first_message() -> None:
+    intake = make()
+    intake.accept(message(0, device_ns=0, wall_ns=NOW_NS + HOUR_NS - S), NOW_NS)
+    [(where, event)] = intake.report(*at(0.1))
+    assert where.identifier == event.vehicle == "truck-1"
+    assert event.kind == EventKind.CLOCK_DRIFT
+    assert event.text == "the truck's clock is 3599.000 s ahead of the logger's"
+    assert intake.clock_figures() == {"clock_offset_s/truck-1": -3599.0}
+    intake.accept(message(1, device_ns=S // 10, wall_ns=NOW_NS + HOUR_NS - 9 * S // 10), NOW_NS)
+    assert intake.report(*at(0.2)) == []
+
+
+def test_late_message_reports_no_clock_at_once() -> None:
+    """It may have waited, for instance in a drive that is played faster than real."""
+    intake = make()
+    intake.accept(message(0, device_ns=0, wall_ns=NOW_NS - HOUR_NS), NOW_NS)
+    assert intake.report(*at(0.1)) == []
+    assert intake.clock_figures() == {}
+
+
 def test_a_replays_old_times_say_nothing_of_clocks() -> None:
     intake = make()
     for number in range(1000):

@@ -1,0 +1,12 @@
+"""The note of a logger's health on clocks."""
+
+from services.logger.health_line import clock_note
+
+
+def test_clocks_that_are_ahead_are_named() -> None:
+    figures = {"clock_offset_s/b": -3599.0, "clock_offset_s/a": -0.5, "clock_offset_s/c": 3600.0}
+    assert clock_note(figures) == "clocks ahead: a by 0.5 s, b by 3599.0 s"
+
+
+def test_right_and_slow_clocks_need_no_note() -> None:
+    assert clock_note({"clock_offset_s/a": -0.4, "lag_s": -99.0, "clock_offset_s/b": 9.0}) == ""
