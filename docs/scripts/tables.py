@@ -31,22 +31,19 @@ _BLOCK = re.compile(r"(<!-- (?:table: )?([a-z ]+) -->\n)(.*?)(<!-- end -->\n)", 
 """Blank lines around the table, without which some readers of Markdown show none."""
 
 SUBSCRIBER = """\
-import json, sys, zenoh
-from schemas.messages import decode
-from schemas.topics import parse_key, topic
+import sys
+from pathlib import Path
+from services.bus.messages import subscribe
+from services.common.errors import FailureError, InputError
 
-config = zenoh.Config()
-config.insert_json5("mode", '"client"')
-config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))  # tcp/127.0.0.1:7447
-history = zenoh.ext.HistoryConfig(detect_late_publishers=True)  # earlier messages, too
-with zenoh.open(config) as session:
-    received = zenoh.ext.declare_advanced_subscriber(session, "driveby/v1/**", history=history)
-    for sample in received:
-        key = parse_key(str(sample.key_expr))
-        message = decode(topic(key.owner, key.stream).message, sample.payload.to_bytes())
+endpoint, keys, *tls = sys.argv[1:]
+try:
+    for key, message in subscribe(endpoint, keys, tls=Path(tls[0]) if tls else None):
         found = getattr(message, "parameters", {})  # of an estimate; none if it was rejected
         ei = (f"{n} {p.q025:.3g} to {p.q975:.3g}" for n, p in sorted(found.items()) if "EI_" in n)
         print(key.realm, key.identifier, key.stream, *ei, flush=True)
+except (FailureError, InputError) as error:
+    sys.exit(str(error))
 """
 
 

@@ -39,6 +39,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from schemas.topics import check_identifier
+from services.bus.access_control import access_control
 from services.bus.credentials import (
     AUTHORITY,
     BUS_ROLES,
@@ -57,7 +58,6 @@ from services.bus.credentials import (
 )
 from services.common.errors import FailureError, InputError
 from services.common.files import read_bytes, write_atomically
-from services.security.access_control import access_control
 from services.security.settings import CertsSettings
 
 AUTHORITY_DAYS = 3650

@@ -28,6 +28,62 @@ def stack() -> Iterator[ExitStack]:
         yield stack
 
 
+def written(project: Path, folder: Path) -> Path:
+    """The subscriber of the page as a file."""
+    text = (project / "docs" / "programmer.md").read_text()
+    code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert len(code) == 1
+    file = folder / "subscriber.py"
+    file.write_text(code[0])
+    return file
+
+
+def subscribe(project: Path, file: Path, *arguments: object) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, str(file), *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={"PYTHONPATH": str(project)},
+    )
+
+
+def test_subscriber_receives_results_over_tls(
+    credentials: Path, tls_endpoint: str, tmp_path: Path, project: Path, stack: ExitStack
+) -> None:
+    """With the arguments of the page, but for the address."""
+    text = (project / "docs" / "programmer.md").read_text()
+    (shown,) = re.findall(r"subscriber.py tls/\S+ '(\S+)' certs/(\S+)", text)
+    stack.enter_context(open_session(listen=tls_endpoint, tls=credentials / "logger"))
+    worker = stack.enter_context(
+        open_session(connect=tls_endpoint, timeout_s=LONGEST_S, tls=credentials / "worker")
+    )
+    publisher = Publisher(worker, "live")
+    stack.callback(publisher.close)
+    publisher.put("bridge", "bridge-1", "state", b"")
+    file = written(project, tmp_path)
+    process = subscribe(project, file, tls_endpoint, shown[0], credentials / shown[1])
+    watchdog = Timer(LONGEST_S, process.kill)
+    watchdog.start()
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "live bridge-1 state\n"
+    finally:
+        watchdog.cancel()
+        process.kill()
+        process.communicate()
+
+
+def test_subscriber_ends_with_one_line_on_a_wrong_folder(tmp_path: Path, project: Path) -> None:
+    folder = tmp_path / "none"
+    file = written(project, tmp_path)
+    process = subscribe(project, file, "tls/127.0.0.1:1", "driveby/v1/*/bridge/**", folder)
+    _, log = process.communicate(timeout=LONGEST_S)
+    assert process.returncode == 1
+    assert len(log.splitlines()) == 1
+    assert log.startswith(f"{folder}/cert.pem: ")
+
+
 def test_it_receives_a_truck_and_prints_its_result(
     start: Start,
     endpoint: str,
@@ -36,11 +92,7 @@ def test_it_receives_a_truck_and_prints_its_result(
     project: Path,
     stack: ExitStack,
 ) -> None:
-    text = (project / "docs" / "programmer.md").read_text()
-    code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    assert len(code) == 1
-    file = tmp_path / "subscriber.py"
-    file.write_text(code[0])
+    file = written(project, tmp_path)
     start_logger(start, endpoint, tmp_path / "live.mcap")
     bus = stack.enter_context(open_session(connect=endpoint, timeout_s=LONGEST_S))
     found = results_of(load_site(project / "docs/site.example.toml"), some_crossing("a"))
@@ -56,7 +108,7 @@ def test_it_receives_a_truck_and_prints_its_result(
         vehicle=None,
     )
     subscriber = subprocess.Popen(
-        [sys.executable, str(file), endpoint],
+        [sys.executable, str(file), endpoint, "driveby/v1/**"],
         stdout=subprocess.PIPE,
         text=True,
         env={"PYTHONPATH": str(project)},

@@ -4,8 +4,8 @@ import pytest
 import zenoh
 
 from schemas.topics import gateway_service, key
+from services.bus.access_control import published_by, read_by
 from services.bus.credentials import Subject
-from services.security.access_control import published_by, read_by
 
 ALARM = zenoh.KeyExpr(key("live", "bridge", "bridge-1", "alarm"))
 

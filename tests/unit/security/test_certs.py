@@ -16,6 +16,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from cryptography.x509.verification import PolicyBuilder, Store
 
 from schemas.topics import TOPICS
+from services.bus.access_control import access_control
 from services.bus.credentials import (
     AUTHORITY,
     CERTIFICATE,
@@ -30,7 +31,6 @@ from services.bus.credentials import (
 from services.bus.session import open_session
 from services.common.errors import InputError
 from services.security import certs
-from services.security.access_control import access_control
 from services.security.certs import certs_command
 from services.security.settings import CertsSettings
 
