@@ -62,7 +62,7 @@ def replaced_atomically(path: Path, *, force: bool = False) -> Iterator[Path]:
             check_writable(path, force=force)  # check again: the block may have taken long
             _check_like(path, temporary)
             temporary.replace(path)
-            _sync(path.parent)
+            sync_folder(path)
         except OSError as error:
             raise FailureError(f"{path}: could not be written: {_reason(error)}") from error
     finally:
@@ -281,6 +281,11 @@ def read_bytes(path: Path) -> bytes:
         raise InputError(f"{path}: no such file") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {_reason(error)}") from error
+
+
+def sync_folder(path: Path) -> None:
+    """Sync the folder of a file, so that its new name survives a loss of power."""
+    _sync(path.parent)
 
 
 def _sync(path: Path) -> None:

@@ -33,6 +33,7 @@ from services.identification.known import CrossingRecord, search_hash
 from services.ledger.crossing_log import CrossingLog, PublishedResult
 from services.ledger.growing_json import AppendableResults
 from services.recordings.recording import is_being_written, read_info, read_messages
+from services.recordings.recovery import NOT_FINISHED
 from services.recordings.writer import RecordingOrigin, RecordingWriter
 
 _log = logging.getLogger(__name__)
@@ -281,7 +282,8 @@ def _runs(folder: Path, now_s: float, age_s: float) -> Iterator[_Run]:
         except (ValueError, OSError) as error:  # any field may be damaged
             _log.warning("skipping the results of an earlier run: %s", error)
             continue
-        was_killed = info.end is None and not goes_on
+        is_finished = info.end is not None and info.end.get("reason") != NOT_FINISHED
+        was_killed = not is_finished and not goes_on
         yield _Run(path, info.start.get("previous"), began_s, goes_on, was_killed)
 
 

@@ -35,6 +35,8 @@ ASIDE = ".crashed"
 """Suffix of a damaged recording that another one has replaced."""
 SERVICE = "recover"
 """Name of the service that writes the event in a recovered recording."""
+NOT_FINISHED = "recovered, the writer did not get to finish it"
+"""Reason in the END of a recovered recording that had none."""
 
 
 class Recovery(NamedTuple):
@@ -94,15 +96,17 @@ def recover_recording(
     *,
     force: bool = False,
     set_aside: bool = False,
+    adds_event: bool = True,
     progress: Offset = no_progress,
 ) -> Recovery:
     """Write the valid content of `source` to `target`, next to it first and then renamed.
 
     Messages, channels, metadata and attachments are copied unchanged, foreign topics too. A lost
     schema is taken from our own tables. Damage after the END sentinel affects only the index, which
-    is rebuilt. Event and metadata `driveby.recovered` document the recovery in the file. Memory is
-    bounded whatever the file holds. `progress` receives the position in it. With `set_aside` the
-    source is renamed then (see `put_aside`), and an interrupt does not leave both.
+    is rebuilt. Metadata `driveby.recovered` and, with `adds_event`, an event document the recovery
+    in the file. Memory is bounded whatever the file holds. `progress` receives the position in it.
+    With `set_aside` the source is renamed then (see `put_aside`), and an interrupt does not leave
+    both.
 
     Raise InputError if `source` is missing, is not MCAP, holds nothing readable, is being written,
     or is `target`, and if there is a recording at `target`, which only `force` replaces;
@@ -133,7 +137,7 @@ def recover_recording(
                 with temporary.open("wb") as out:
                     library = f"driveby {program_version()}"
                     writer = McapWriter(out.write, library=library, chunk_bytes=CHUNK_BYTES)
-                    copy = _Copier(source, writer)
+                    copy = _Copier(source, writer, adds_event=adds_event)
                     for item in _read(source, file, progress):
                         copy.take(item)
                     recovery = copy.finish(source, source.stat().st_size, now_ns)
@@ -154,9 +158,10 @@ def _read(source: Path, file: BinaryIO, progress: Offset = no_progress) -> Itera
 class _Copier:
     """A copier of valid items from one file to another."""
 
-    def __init__(self, source: Path, writer: McapWriter) -> None:
+    def __init__(self, source: Path, writer: McapWriter, *, adds_event: bool) -> None:
         self._source = source
         self._writer = writer
+        self._adds_event = adds_event
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._new_schemas: dict[tuple[str, str, bytes], int] = {}
@@ -289,7 +294,7 @@ class _Copier:
         self._writer.add_metadata(RECOVERED, summary)
         written = recovery.messages
         realm = self._realm()
-        if recovery.is_lossy and realm is not None:
+        if self._adds_event and recovery.is_lossy and realm is not None:
             self._add_event(Key(realm, "service", SERVICE, "event"), recovery, now_ns)
             written += 1
         identities = {
@@ -299,7 +304,7 @@ class _Copier:
         }
         self._writer.add_metadata(IDENTITIES, identities_text(identities))
         end = self._end or {
-            "reason": "recovered, the writer did not get to finish it",
+            "reason": NOT_FINISHED,
             "time_ns": str(self._last_ns or now_ns),
         }
         self._writer.add_metadata(END, end | {"messages": str(written)})

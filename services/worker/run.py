@@ -36,6 +36,7 @@ from services.identification.methods import METHODS
 from services.identification.waiting import Validations
 from services.ledger.baselines import baselines_of
 from services.ledger.crossing_log import Ledger
+from services.ledger.cut_off_results import recover_cut_off_results
 from services.ledger.runs import (
     KNOWN_AGE_S,
     EarlierRuns,
@@ -146,12 +147,13 @@ def _check(asked: WorkerSettings) -> None:
 
 @contextlib.contextmanager
 def _locked_folder(asked: WorkerSettings) -> Iterator[None]:
-    """Hold the lock of the folder of results, if the run writes there."""
+    """Hold the lock of the folder of results, complete after a kill, if the run writes there."""
     if asked.file is not None:
         yield
         return
     lock = lock_folder(asked.folder / asked.realm, _LOCK, _IN_USE)
     try:
+        recover_cut_off_results(asked.folder / asked.realm)
         yield
     finally:
         os.close(lock)
@@ -172,10 +174,10 @@ def _catches_up(asked: WorkerSettings) -> bool:
 
 
 def _earlier_runs(asked: WorkerSettings, search: Search) -> EarlierRuns:
-    if asked.file is not None or is_from_recording(asked.realm):
+    if asked.file is not None:
         return EarlierRuns()
     age_s = asked.recordings_days * _DAY_S + MARGIN_S if _catches_up(asked) else 0.0
-    return read_earlier(
+    earlier = read_earlier(
         asked.folder / asked.realm,
         asked.realm,
         time.time(),
@@ -183,6 +185,8 @@ def _earlier_runs(asked: WorkerSettings, search: Search) -> EarlierRuns:
         search.fusing,
         max(KNOWN_AGE_S, age_s),
     )
+    # Reading completes JSON files; results of an earlier replay do not count.
+    return EarlierRuns() if is_from_recording(asked.realm) else earlier
 
 
 def _check_writable(asked: WorkerSettings, file: Path, certificates: Path) -> None:
