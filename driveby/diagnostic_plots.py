@@ -9,8 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from services.common.errors import InputError
+from services.notebook.arguments import names_of
 from services.notebook.inference import prior_draws
-from services.notebook.solution import Solution
+from services.notebook.solution import Identification, Solution, one_solution
 from services.viewer.drawing import STYLE
 
 _COLUMNS: Final = 4
@@ -21,12 +22,13 @@ _CUT: Final = (0.5, 99.5)
 """Percentiles of the prior draws that are drawn."""
 
 
-def plot_residual(solution: Solution) -> Figure:
+def plot_residual(solution: Solution | Identification) -> Figure:
     """Draw the profile under the front wheel minus that under the rear wheel, over the chainage.
 
     Long waves, the drift of twice integrated accelerations, have little weight in the fit. Raise
     InputError for a crossing without a road profile.
     """
+    solution = one_solution("solution", solution, "plot_residual")
     road = solution.crossing.road
     if road is None:
         raise InputError(f"{solution.crossing.crossing_id}: has no road profile")
@@ -44,11 +46,14 @@ def plot_residual(solution: Solution) -> Figure:
     return figure
 
 
-def plot_posterior(solution: Solution, names: Sequence[str] | None = None) -> Figure:
+def plot_posterior(
+    solution: Solution | Identification, names: Sequence[str] | None = None
+) -> Figure:
     """Draw prior and posterior density of parameters, by default of all EI, with 95 % intervals.
 
     Raise InputError for an unknown name or a crossing without draws.
     """
+    solution = one_solution("solution", solution, "plot_posterior")
     with matplotlib.rc_context(STYLE):
         figure, panels = _panels(_chosen(solution, names), 2.0)
         for name, axes in panels:
@@ -77,11 +82,12 @@ def plot_posterior(solution: Solution, names: Sequence[str] | None = None) -> Fi
     return figure
 
 
-def plot_chains(solution: Solution, names: Sequence[str] | None = None) -> Figure:
+def plot_chains(solution: Solution | Identification, names: Sequence[str] | None = None) -> Figure:
     """Draw the draws of parameters in their order, by default of all EI, a line for each chain.
 
     Raise InputError for an unknown name or a crossing without draws.
     """
+    solution = one_solution("solution", solution, "plot_chains")
     with matplotlib.rc_context(STYLE):
         figure, panels = _panels(_chosen(solution, names), 1.8)
         for name, axes in panels:
@@ -107,7 +113,9 @@ def _chosen(solution: Solution, names: Sequence[str] | None) -> list[str]:
         raise InputError(
             f"{solution.crossing.crossing_id}: has no draws; method pre has, with draws=True"
         )
-    chosen = [name for name in known if name.startswith("EI_")] if names is None else list(names)
+    chosen = [name for name in known if name.startswith("EI_")]
+    if names is not None:
+        chosen = names_of("names", names)
     for name in chosen:
         if name not in known:
             raise InputError(f"{name}: is unknown, it must be one of {', '.join(known)}")

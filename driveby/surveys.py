@@ -1,10 +1,14 @@
 """Forecasts of surveys in a notebook, as by `driveby survey`."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
 
 from schemas.site import Site
 from services.common.errors import InputError
 from services.execution.blas import one_blas_thread
+from services.notebook.arguments import number, one_or_two, whole
 from services.notebook.read import Name, given_site
 from services.planning.forecast_text import as_json, lines_of
 from services.planning.plan_survey import SurveyWishes, plan_survey
@@ -30,31 +34,30 @@ def survey(
     *,
     loss: float = 0.2,
     crossings: int = 12,
-    speed: float | tuple[float, float] | None = None,
+    speed: float | Sequence[float] | NDArray[Any] | None = None,
     road: str | None = None,
     tyres: str | None = None,
     noise: float | None = None,
 ) -> SurveyPlan:
     """Forecast a survey of the site's first bridge by its first truck.
 
-    The options are those of `driveby survey` but for `--wander`; `speed` is in m/s, or a pair
-    (slowest, fastest). BLAS is limited to one thread meanwhile. Raise InputError, in one line, for
+    The options are those of `driveby survey` but for `--wander`; `speed` is in m/s, or a pair (2,):
+    slowest and fastest. BLAS is limited to one thread meanwhile. Raise InputError, in one line, for
     an impossible value.
     """
-    slowest, fastest = speed if isinstance(speed, tuple) else (speed, speed)
-    for what, value, low, high in (
-        ("loss", loss, 0.01, 0.95),
-        ("crossings", crossings, 1, 300),
-        ("speed", slowest, 1, 50),
-        ("speed", fastest, slowest or 1, 50),
-        ("noise", noise, 0.1, 1e6),
-    ):
-        if value is not None and not low <= value <= high:
-            raise InputError(f"{what} is {value:g}, it must be from {low:g} to {high:g}")
+    speeds = None if speed is None else one_or_two("speed", speed, 1, 50, "(slowest, fastest)")
+    if speeds is not None:
+        number("speed", speeds[1], speeds[0], 50)
     for what, choice, known in (("road", road, "ABCDE"), ("tyres", tyres, ("single", "twin"))):
         if choice is not None and choice not in tuple(known):
             raise InputError(f'{what} is "{choice}", it must be one of {", ".join(known)}')
-    speeds = None if slowest is None or fastest is None else (slowest, fastest)
-    wishes = SurveyWishes(loss, crossings, speeds, road, tyres, noise)
+    wishes = SurveyWishes(
+        number("loss", loss, 0.01, 0.95),
+        whole("crossings", crossings, 1, 300),
+        speeds,
+        road,
+        tyres,
+        None if noise is None else number("noise", noise, 0.1, 1e6),
+    )
     with one_blas_thread():
         return SurveyPlan(plan_survey(given_site(site), wishes, lambda done, jobs: None))

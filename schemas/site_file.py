@@ -36,7 +36,12 @@ _LISTS: Final = ("vehicle", "bridge", "ros2")
 
 def load_site(path: str | Path) -> Site:
     """Read a site file; raise InputError in one line if it cannot be read or is wrong."""
-    return parse_site(read_site_text(Path(path)), str(path))
+    try:
+        place = Path(path)
+    except TypeError as error:
+        kind = type(path).__name__
+        raise InputError(f"site is of type {kind}, it must be the name of a site file") from error
+    return parse_site(read_site_text(place), str(path))
 
 
 def read_site_text(path: Path) -> str:
@@ -56,6 +61,10 @@ def with_values(site: Site, values: Mapping[str, object]) -> Site:
     or bridges, the identifier takes the place of the table's name. None restores a default. Raise
     InputError in one line for a name or value that a site file must not have.
     """
+    if not isinstance(site, Site):
+        raise InputError(
+            f"site is of type {type(site).__name__}, it must be what load_site() returns"
+        )
     tables = parse_toml(site_toml(site), "the site")
     by_name: dict[str, list[tuple[str, dict[str, Any]]]] = {}
     for kind, found in tables.items():

@@ -39,7 +39,7 @@ from services.finding.order import index_messages
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
 from services.history.validation_files import passed_validations
 from services.identification.bridge_state import Fusing
-from services.identification.methods import METHODS
+from services.identification.methods import lacks_noise
 from services.ledger.baselines import baselines_of
 from services.recordings.recording import read_messages
 from services.recordings.remote import all_fetched, is_folder_of_recordings
@@ -170,10 +170,7 @@ def check_certificates(certificates: Path | None) -> None:
 
 def warn_of_no_noise(site: Site, method: str) -> None:
     """Warn where a method cannot use sensors without noise."""
-    from services.finding.placed import middle_sensor
-
-    noise = (middle_sensor(site.sensor, one).noise_density_ug_per_rthz for one in site.vehicles)
-    if METHODS[method].has_noise_model and not any(map(any, noise)):
+    if lacks_noise(site, method):
         _log.warning(
             "the site declares sensors without noise, which method pre cannot use; "
             "simulations without noise are for --method least-squares"

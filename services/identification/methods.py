@@ -3,7 +3,9 @@
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
+from schemas.site import Site
 from services.finding.crossing_data import WindowOf, close_window, wide_window
+from services.finding.placed import middle_sensor
 from services.finding.stays import LONGEST_BRIDGED_S
 
 LONGEST_SURE_OUTAGE_S = 1.5
@@ -33,6 +35,12 @@ METHODS: Final[Mapping[str, IdentificationMethod]] = {
     "least_squares": _PAPER,
     "random_walk": _PAPER,
 }
+
+
+def lacks_noise(site: Site, method: str) -> bool:
+    """Return whether a method needs the sensors' noise, and the site declares none."""
+    densities = (middle_sensor(site.sensor, one).noise_density_ug_per_rthz for one in site.vehicles)
+    return METHODS[method].has_noise_model and not any(map(any, densities))
 
 
 def window_of(method: str) -> WindowOf:

@@ -12,14 +12,19 @@ from services.recordings.recording import read_site
 _log = logging.getLogger(__name__)
 
 
-def site_of_results(path: Path, results: Results, site: Path | None = None) -> Site:
-    """Return the given site file, or the one of a recording in the folder of the results.
+def site_of_results(path: Path, results: Results, site: Path | Site | None = None) -> Site:
+    """Return the given site, or the one of a recording in the folder of the results.
 
     A site file other than that of the results is accepted with a warning, so that a corrected name
     of a bridge appears in the report. Raise InputError if there is none, or if it lacks a bridge of
     the results.
     """
-    known, name = (load_site(site), str(site)) if site is not None else _site_nearby(path, results)
+    if isinstance(site, Site):
+        known, name = site, "the given site"
+    elif site is not None:
+        known, name = load_site(site), str(site)
+    else:
+        known, name = _site_nearby(path, results)
     missing = wanted_bridges(results) - {bridge.id for bridge in known.bridges}
     if missing:
         raise InputError(f"{path}: has results of {min(missing)}, which {name} does not know")

@@ -1,18 +1,27 @@
 """Fusion of the crossings of several results, as by `driveby fuse`."""
 
+from collections.abc import Iterable, Sequence
 from html import escape
+from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
-from schemas.results import BridgeResult, Results, load_results, results_json
+from schemas.results import BridgeResult, CrossingResult, Results, load_results, results_json
+from schemas.site import Site
 from services.common.errors import InputError
 from services.common.files import check_writable, write_atomically
 from services.common.kinds import RESULTS
 from services.execution.blas import one_blas_thread
 from services.execution.fuse_results import FusedElements, crossings_to_fuse, fuse_crossings
-from services.notebook.read import Name
+from services.notebook.arguments import path_of
+from services.notebook.read import Name, given_site
 from services.notebook.showing import RIGIDITY_HEAD, html_table, rigidity_cells
 from services.notebook.solution import Identification
+
+RESULTS_EXPECTED: Final = (
+    "the name of a results file, or what identify() or fuse() returns; "
+    "several are several arguments"
+)
 
 
 class Fusion(NamedTuple):
@@ -21,11 +30,27 @@ class Fusion(NamedTuple):
     results: Results
     """Crossings with the fused estimate of each bridge, as in results.json."""
     elements_of: dict[str, FusedElements]
+    """Elements of each bridge and their nominal values, by its identifier."""
+    site: Site | None = None
+    """Site file, for figures and reports; None where only results files were given."""
+    baseline: Results | None = None
+    """Results compared with; None without a baseline."""
 
     @property
     def bridges(self) -> dict[str, BridgeResult]:
         """Fused estimate of each bridge, by its identifier."""
         return dict(self.results.bridges)
+
+    def site_with(self, bridges: Iterable[str]) -> Site:
+        """Return the site file; raise InputError without one that has all these bridges."""
+        known = () if self.site is None else tuple(bridge.id for bridge in self.site.bridges)
+        for bridge in bridges:
+            if self.site is None or bridge not in known:
+                raise InputError(
+                    f'{bridge}: has no site file, fuse(..., site="site.toml") gives one'
+                )
+        assert self.site is not None  # noqa: S101 - every fusion has a bridge
+        return self.site
 
     def to_json(self, path: str | Path) -> None:
         """Write results.json, as `driveby fuse --json` does."""
@@ -56,36 +81,68 @@ class Fusion(NamedTuple):
 
 
 def fuse(
-    *sources: Name | Identification | Results,
-    baseline: Name | Results | None = None,
+    *sources: Name | Identification | Fusion | Results,
+    baseline: Name | Identification | Fusion | Results | None = None,
     fuse_suspect: bool = False,
+    site: Name | Site | None = None,
 ) -> Fusion:
     """Fuse all crossings of results (files, or what `identify` returned), each once.
 
-    Of a crossing in several results the newest counts. `baseline` is compared with. BLAS is limited
-    to one thread meanwhile. The same results give the same numbers as `driveby fuse`. Raise
-    InputError, in one line, for unreadable results, several realms, or nothing that can be fused.
+    `baseline` is compared with. `site` is needed for a figure or report of files alone. BLAS is
+    limited to one thread meanwhile. The same results give the same numbers as `driveby fuse`.
+
+    Raise InputError, in one line, for unreadable results, several realms, crossings that differ and
+    have one identifier, or nothing that can be fused.
     """
     if not sources:
         raise InputError("no results given, results.json or the value of identify() expected")
-    name = next((str(one) for one in sources if not isinstance(one, Identification | Results)), "")
-    found = crossings_to_fuse(name or "fuse", [_results(one) for one in sources])
+    name = next((str(one) for one in sources if isinstance(one, str | PathLike)), "fuse")
+    each = [_results("source", one) for one in sources]
+    _check_identifiers(each)
+    found = crossings_to_fuse(name, each)
     stored = None
     if baseline is not None:
-        place = "baseline" if isinstance(baseline, Results) else str(baseline)
-        stored = (place, _results(baseline))
+        place = str(baseline) if isinstance(baseline, str | PathLike) else "baseline"
+        stored = (place, _results("baseline", baseline))
     with one_blas_thread():
         fused = fuse_crossings(
-            name or "fuse",
+            name,
             found,
             stored,
             lambda bridge, stage, share: None,
             fuse_suspect=fuse_suspect,
         )
-    return Fusion(fused.results, fused.bridges)
+    known = _newest_site(sources) if site is None else given_site(site)
+    return Fusion(fused.results, fused.bridges, known, None if stored is None else stored[1])
 
 
-def _results(source: Name | Identification | Results) -> Results:
-    if isinstance(source, Identification):
+def _results(name: str, source: object) -> Results:
+    """Return results given as an argument of this name; raise InputError for anything else."""
+    if isinstance(source, Identification | Fusion):
         return source.results
-    return source if isinstance(source, Results) else load_results(Path(source))
+    if isinstance(source, Results):
+        return source
+    return load_results(path_of(name, source, RESULTS_EXPECTED))
+
+
+def _check_identifiers(files: Sequence[Results]) -> None:
+    """Raise InputError if crossings of one identifier have different estimates."""
+    known: dict[str, CrossingResult] = {}
+    for one in (crossing for results in files for crossing in results.crossings):
+        first = known.setdefault(one.crossing_id, one)
+        if first.parameters != one.parameters:
+            raise InputError(
+                f"{one.crossing_id}: two crossings with this identifier differ; of one crossing "
+                "give one result, and start each simulated one at another time: "
+                'simulation.started_at("2026-05-01T09:30:00Z")'
+            )
+
+
+def _newest_site(sources: Sequence[object]) -> Site | None:
+    """Return the site of the newest results that have one."""
+    with_site = [
+        (one.results.created, one.site)
+        for one in sources
+        if isinstance(one, Identification | Fusion) and one.site is not None
+    ]
+    return max(with_site, key=lambda one: one[0])[1] if with_site else None

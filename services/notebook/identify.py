@@ -1,8 +1,9 @@
 """Identification of all crossings of recordings, CSV folders or a simulation."""
 
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from os import PathLike
-from typing import get_args
+from typing import Final, get_args
 
 from schemas.results import Method
 from schemas.settings import IdentificationSettings
@@ -12,9 +13,17 @@ from services.execution.inline import InlineExecutor
 from services.execution.offline import identify_drives
 from services.finding.order import Read, cached_reader, index_messages
 from services.history.draws import Draws
+from services.identification.methods import lacks_noise
+from services.notebook.arguments import whole, wrong
 from services.notebook.read import Name, given_site, messages_of_paths, paths_of, site_of_paths
 from services.notebook.simulate import Simulation
 from services.notebook.solution import Identification, Solution
+
+_NO_NOISE: Final = (
+    "the site declares sensors without noise, which method pre cannot use: simulate(..., noise=25) "
+    'adds noise, and identify(..., method="least_squares") needs none'
+)
+_SOURCES: Final = "a recording (.mcap), a folder of CSV files, a list of these or a simulation"
 
 
 def identify(
@@ -33,7 +42,8 @@ def identify(
     site.toml). `method` is pre, least_squares or random_walk. `draws=False` drops the posterior
     draws: about 1 MB a crossing. `say` is called with progress messages. BLAS is limited to one
     thread meanwhile. The same source, site, method and seed give the same numbers as `driveby
-    identify`.
+    identify`. A site without sensor noise, as of a simulation by default, brings a warning with
+    method pre.
 
     Raise InputError, in one line, for unreadable input; a crossing that cannot be identified is no
     error but has a verdict.
@@ -43,9 +53,11 @@ def identify(
         known, name = source.site if site is None else given_site(site), "simulation"
         read: Read = source.messages
     else:
-        paths = paths_of([source] if isinstance(source, str | PathLike) else list(source))
+        paths = paths_of(_several(source))
         known, name = site_of_paths(paths, site), ", ".join(str(path) for path in paths)
         read = cached_reader(lambda again: messages_of_paths(paths, known, site, vehicle))
+    if lacks_noise(known, settings.method):
+        warnings.warn(_NO_NOISE, stacklevel=2)
     kept: dict[str, Draws] = {}
 
     def keep(crossing_id: str, chains: Draws) -> None:
@@ -64,10 +76,24 @@ def identify(
     return Identification(tuple(solutions), found, known)
 
 
+def _several(source: object) -> list[Name]:
+    """Return the names of one source or several; raise InputError for anything else."""
+    if isinstance(source, str | PathLike):
+        return [source]
+    if not isinstance(source, Iterable) or hasattr(source, "_fields"):
+        raise wrong("source", source, _SOURCES)
+    several = list(source)
+    if any(isinstance(one, Simulation) for one in several):
+        raise InputError(
+            "source is a list with a simulation, it must be one simulation; "
+            "fuse(identify(a), identify(b)) fuses several"
+        )
+    return several
+
+
 def _settings(method: str, seed: int) -> IdentificationSettings:
-    name = method.replace("-", "_")
+    name = method.replace("-", "_") if isinstance(method, str) else method
     if name not in get_args(Method):
-        raise InputError(f'method is "{method}", one of {", ".join(get_args(Method))} expected')
-    if not 0 <= seed < 1 << 64:
-        raise InputError(f"seed is {seed}, it must be a whole number from 0 on")
-    return IdentificationSettings.model_validate({"method": name, "seed": seed})
+        raise wrong("method", method, f"one of {', '.join(get_args(Method))}")
+    known = whole("seed", seed, 0, (1 << 64) - 1)
+    return IdentificationSettings.model_validate({"method": name, "seed": known})

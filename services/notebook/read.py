@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from schemas.site import Site
 from schemas.site_file import load_site, parse_site
@@ -11,9 +11,13 @@ from schemas.topics import Message
 from services.common.errors import InputError
 from services.drives.importing import messages_of_folder, vehicle_of
 from services.drives.signals import Signals, signals_of_folder, signals_of_recording
+from services.notebook.arguments import path_of
 from services.recordings.recording import read_messages, read_site
 
 Name: TypeAlias = str | PathLike[str]
+
+_SOURCE: Final = "a recording (.mcap) or a folder of CSV files"
+_SITE: Final = "the name of a site file or what load_site() returns"
 
 
 def read(
@@ -44,7 +48,7 @@ def paths_of(sources: Sequence[Name]) -> list[Path]:
     """Return the sources as paths; InputError if there is none or one does not exist."""
     if not sources:
         raise InputError("no source given, a recording (.mcap) or a folder of CSV files expected")
-    paths = [Path(source) for source in sources]
+    paths = [path_of("source", source, _SOURCE) for source in sources]
     for path in paths:
         if not path.exists():
             raise InputError(
@@ -81,7 +85,7 @@ def messages_of_paths(
 
 def given_site(site: Name | Site) -> Site:
     """Return the site, read if it is the name of a file."""
-    return site if isinstance(site, Site) else load_site(Path(site))
+    return site if isinstance(site, Site) else load_site(path_of("site", site, _SITE))
 
 
 def site_of_folder(folder: Path, site: Name | Site | None) -> Site | None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ from services.drives.runs import run_to_messages
 from services.drives.signals import Signals, signals_of_run
 from services.execution.blas import one_blas_thread
 from services.finding.placed import middle_site
+from services.notebook.arguments import number, numbers, one_or_two, whole, wrong
 from services.notebook.read import Name, given_site
 from services.simulation.drive import (
     DrivenRoad,
@@ -28,9 +29,11 @@ from services.simulation.drive import (
     write_drive,
 )
 from services.simulation.lane import twist_of
+from services.simulation.schedule import begun_at, schedule_of
 
-_REALM = "sim-drive"
-_SCENARIOS = range(1, 13)
+_REALM: Final = "sim-drive"
+_SCENARIOS: Final = 12
+_RATIOS: Final = "a ratio for each element, such as [1, 1, 0.4]"
 
 
 class Simulation(NamedTuple):
@@ -70,6 +73,16 @@ class Simulation(NamedTuple):
         """Return the messages that the truck would have sent."""
         return run_to_messages([self.drive.run], self.site, _REALM, self.site.vehicles[0].id)
 
+    def started_at(self, start: str) -> "Simulation":
+        """Return the same drive with another start, ISO 8601 with a zone; InputError otherwise.
+
+        A crossing's identifier contains its time: crossings to be fused must differ in it.
+        """
+        if not isinstance(start, str):
+            raise wrong("start", start, "a time as 2026-05-01T09:30:00Z")
+        begin_s = schedule_of(1, 1, start, name="start").begin_s(0)
+        return self._replace(drive=self.drive._replace(run=begun_at(self.drive.run, begin_s)))
+
     def write(self, path: str | Path, *, force: bool = False) -> None:
         """Write the recording (.mcap) that the truck would have made.
 
@@ -82,12 +95,12 @@ class Simulation(NamedTuple):
 def simulate(
     *,
     scenario: int | None = None,
-    ei: Sequence[float] | None = None,
+    ei: Sequence[float] | NDArray[Any] | None = None,
     site: Name | Site | None = None,
     road: str | tuple[ArrayLike, ArrayLike] = "A",
     seed: int = 1,
     noise: float = 0.0,
-    speed: float | tuple[float, float] = 10.0,
+    speed: float | Sequence[float] | NDArray[Any] = 10.0,
     direction: str = "start_to_end",
     gps_noise: bool = False,
     rate: float | None = None,
@@ -95,41 +108,38 @@ def simulate(
     """Simulate a crossing of the site's first bridge by its first truck.
 
     The options are those of `driveby simulate`. The truth is a damage `scenario` of the paper (1 to
-    12) or `ei`, the ratio of each element's EI to its nominal value. `site` is by default that of
-    the paper. `road` is an ISO 8608 class, A to E, or a profile under both axles: chainages and
-    heights (n,) in m, level beyond its ends; `noise` the accelerometers' noise density in
-    µg/√Hz; `speed` in m/s, or a pair (start, end); `rate` in Hz is by default the site's. BLAS is
-    limited to one thread meanwhile.
+    12) or `ei` (n,), the ratio of each element's EI to its nominal value. `site` is by default that
+    of the paper. `road` is an ISO 8608 class, A to E, or a profile under both axles: chainages and
+    heights (n,) in m, level beyond its ends. `noise` is the accelerometers' noise density in
+    µg/√Hz; method pre needs some. `speed` is in m/s, or a pair (start, end); `rate` in Hz is by
+    default the site's. BLAS is limited to one thread meanwhile.
+
+    All drives begin at one time; crossings to be fused need others: `Simulation.started_at`.
 
     Raise InputError, in one line, for an impossible value, FailureError if the simulation does not
     converge.
     """
     if (scenario is None) == (ei is None):
         raise InputError("give either scenario= or ei=")
-    if scenario is not None and scenario not in _SCENARIOS:
-        raise InputError(f"scenario is {scenario}, it must be 1 to 12")
     if direction not in ("start_to_end", "end_to_start"):
         raise InputError(f'direction is "{direction}", start_to_end or end_to_start expected')
-    begin, end = speed if isinstance(speed, tuple) else (speed, speed)
-    for what, value, low, high in (
-        ("seed", seed, 0, (1 << 63) - 1),
-        ("noise", noise, 0, 1e6),
-        ("speed", begin, 0.1, 60),
-        ("speed", end, 0.1, 60),
-        ("rate", 1000.0 if rate is None else rate, 50, 50_000),
-        *(("ei", ratio, 1e-3, 1e3) for ratio in ei or ()),
-    ):
-        if not low <= value <= high:
-            raise InputError(f"{what} is {value:g}, it must be from {low:g} to {high:g}")
+    number_of = None if scenario is None else whole("scenario", scenario, 1, _SCENARIOS)
+    ratios = None if ei is None else numbers("ei", ei, 1e-3, 1e3, _RATIOS)
+    speeds = one_or_two("speed", speed, 0.1, 60, "(start, end)")
+    density = number("noise", noise, 0, 1e6)
     known = paper_site() if site is None else middle_site(given_site(site))
     with one_blas_thread():
         drive = simulate_drive(
             known,
-            ratios_of(known.bridges[0], scenario, ei),
-            DrivenRoad(given_road(road), seed),
-            Measurement(noise, rate_hz=rate, has_receiver_errors=gps_noise),
-            speed_m_per_s=(begin, end),
+            ratios_of(known.bridges[0], number_of, ratios),
+            DrivenRoad(given_road(road), whole("seed", seed, 0, (1 << 63) - 1)),
+            Measurement(
+                density,
+                rate_hz=None if rate is None else number("rate", rate, 50, 50_000),
+                has_receiver_errors=gps_noise,
+            ),
+            speed_m_per_s=speeds,
             forward=direction == "start_to_end",
             beyond=OutOfModelEffects(twist=twist_of(known.bridges[0])),
         )
-    return Simulation(drive, declared_site(known, noise, drive.run.rate_hz))
+    return Simulation(drive, declared_site(known, density, drive.run.rate_hz))

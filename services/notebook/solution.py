@@ -20,6 +20,7 @@ from services.history.draws import (
     posterior,
     write_draws,
 )
+from services.notebook.arguments import wrong
 from services.notebook.inference import prior_of, statistics_of
 from services.notebook.showing import MAX_SHOWN, all_as_html, as_html, counted, one_line
 
@@ -153,6 +154,20 @@ class Identification(NamedTuple):
         """Write results.json, as `driveby identify --json` does."""
         check_writable(Path(path), kinds=(RESULTS,))
         write_atomically(Path(path), results_json(self.results))
+
+
+def one_solution(name: str, found: object, function: str) -> Solution:
+    """Return the only crossing of an argument of a function; InputError for anything else."""
+    if isinstance(found, Identification):
+        if len(found.solutions) != 1:
+            raise InputError(
+                f"{function} draws one crossing, these are {len(found.solutions)}: "
+                f"{function}(found.solutions[0]), …"
+            )
+        return found.solutions[0]
+    if not isinstance(found, Solution):
+        raise wrong(name, found, "what identify() returns or one of its solutions")
+    return found
 
 
 def _draws_of(solution: Solution) -> DrawsOfCrossing:

@@ -44,15 +44,18 @@ class Schedule(NamedTuple):
 ONCE: Final = Schedule()
 
 
-def schedule_of(runs: int, days: int, start: str | None) -> Schedule:
-    """Return the schedule of these options; raise InputError for an impossible one."""
+def schedule_of(runs: int, days: int, start: str | None, *, name: str = "--start") -> Schedule:
+    """Return the schedule of these options; raise InputError for an impossible one.
+
+    `name` is that of the start in an error.
+    """
     from services.drives.tables.stamps import start_of
 
     if runs * days > _MAX_RUNS:
         raise InputError(f"--days: makes {runs * days} runs, it must be at most {_MAX_RUNS}")
-    start_s = None if start is None else start_of(start, None, "--start", has_zone_option=False)
+    start_s = None if start is None else start_of(start, None, name, has_zone_option=False)
     if start_s is not None and not _START_S[0] <= start_s <= _START_S[1]:
-        raise InputError(f'--start: is "{start}", it must be a time from 1970 to 2100')
+        raise InputError(f'{name}: is "{start}", it must be a time from 1970 to 2100')
     return Schedule(runs, days, start_s)
 
 

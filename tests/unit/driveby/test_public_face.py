@@ -15,7 +15,14 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import driveby
-from schemas.results import ElementState, Parameter
+from schemas.results import (
+    CrossingResult,
+    ElementState,
+    Parameter,
+    ResultHeader,
+    Results,
+    results,
+)
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
 from schemas.topics import Message
@@ -26,7 +33,7 @@ from services.notebook import simulate as simulating
 from services.recordings.recording import read_messages
 from services.recordings.writer import write_recording
 from services.simulation import drive as driving
-from services.simulation.drive import SimulatedDrive, paper_site
+from services.simulation.drive import SimulatedDrive, declared_site, paper_site
 from tests.unit.identification.test_fusing import crossing, write
 
 
@@ -423,18 +430,38 @@ def test_simulate_is_the_command(tmp_path: Path) -> None:
     assert mine.read_bytes() == theirs.read_bytes()
 
 
+def test_arrays_and_lists_stand_for_numbers_as_tuples_do(
+    scenario_6: SimulatedDrive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[Any, int, Any]] = []
+
+    def spy(_: object, ratios: Any, road: Any, *__: object, **options: Any) -> SimulatedDrive:
+        asked.append((ratios, road.seed, options["speed_m_per_s"]))
+        return scenario_6
+
+    monkeypatch.setattr(simulating, "simulate_drive", spy)
+    ratios = [1.0, 1.0, 0.4, 1.0, 1.0, 1.0, 1.0]
+    for kind in (list, tuple, np.array):
+        driveby.simulate(ei=kind(ratios), speed=kind([9.0, 11.0]), seed=np.int64(3))
+        found, seed, speed = asked.pop()
+        assert (found.tolist(), seed, speed) == (ratios, 3, (9.0, 11.0))
+    driveby.simulate(scenario=np.int64(6), speed=np.float32(12.0))
+    assert asked.pop()[1:] == (1, (12.0, 12.0))
+
+
 def test_simulate_is_exact_by_default(
     scenario_6: SimulatedDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: dict[str, object] = {}
+    asked: list[Any] = []
 
-    def spy(*_: object, **options: object) -> SimulatedDrive:
-        asked.update(options)
+    def spy(*arguments: object, **_: object) -> SimulatedDrive:
+        asked[:] = arguments
         return scenario_6
 
     monkeypatch.setattr(simulating, "simulate_drive", spy)
     simulation = driveby.simulate(scenario=6)
-    assert (asked["noise_ug_per_rthz"], asked["receiver_errors"]) == (0.0, False)
+    measured = asked[3]
+    assert (measured.noise_ug_per_rthz, measured.has_receiver_errors) == (0.0, False)
     assert simulation.site == driveby.simulate(scenario=6, noise=0.0).site
     assert simulation.site != driveby.simulate(scenario=6, noise=1.0).site
 
@@ -442,16 +469,16 @@ def test_simulate_is_exact_by_default(
 def test_simulate_drives_over_a_given_profile(
     scenario_6: SimulatedDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: dict[str, Any] = {}
+    asked: list[Any] = []
 
-    def spy(*_: object, **options: object) -> SimulatedDrive:
-        asked.update(options)
+    def spy(*arguments: object, **_: object) -> SimulatedDrive:
+        asked[:] = arguments
         return scenario_6
 
     monkeypatch.setattr(simulating, "simulate_drive", spy)
     x_m = np.arange(-50.0, 90.0, 0.05)
     driveby.simulate(scenario=6, road=(x_m, 0.002 * np.sin(x_m)))
-    driven = driving._profile(-61.3, 75.2, asked["road_class"], 1)
+    driven = driving._profile(-61.3, 75.2, asked[2].kind, 1)
     assert np.allclose(np.diff(driven.x_m), 0.01)
     assert (driven.x_m[0], driven.x_m[-1]) == pytest.approx((-62.0, 76.0))
     inside = (driven.x_m > -50.0) & (driven.x_m < 89.0)
@@ -493,6 +520,25 @@ def test_plot_draws_estimate_and_truth(
         driveby.plot(twice)
 
 
+def test_site_without_noise_is_warned_of_before_pre(
+    simulation: driveby.Simulation,
+    exact: driveby.Identification,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(identifying, "identify_drives", lambda *_: exact.results)
+    quiet = simulation._replace(site=declared_site(simulation.site, 0.0, 1000.0))
+    with pytest.warns(UserWarning, match="sensors without noise, which method pre cannot use") as w:
+        driveby.identify(quiet)
+    assert w[0].filename == __file__
+    driveby.identify(simulation)  # with noise; a warning would be an error
+    driveby.identify(quiet, method="random_walk")
+
+
+def test_simulations_are_identified_one_by_one(simulation: driveby.Simulation) -> None:
+    with pytest.raises(driveby.InputError, match="source is a list with a simulation, it must be"):
+        driveby.identify([simulation])
+
+
 # -- what is wrong is said in one line
 
 
@@ -502,11 +548,14 @@ def test_plot_draws_estimate_and_truth(
         (lambda: driveby.read(), "no source given"),
         (lambda: driveby.read("nowhere.mcap"), "nowhere.mcap: no such file"),
         (lambda: driveby.identify("nowhere"), "nowhere: no such file"),
-        (lambda: driveby.identify("x", method="magic"), 'method is "magic", one of pre'),
+        (lambda: driveby.identify("x", method="magic"), 'method is "magic", it must be one of pre'),
         (lambda: driveby.identify("x", seed=-1), "seed is -1"),
         (lambda: driveby.simulate(), "give either scenario= or ei="),
         (lambda: driveby.simulate(scenario=6, ei=[1.0]), "give either scenario= or ei="),
-        (lambda: driveby.simulate(scenario=13), "scenario is 13, it must be 1 to 12"),
+        (
+            lambda: driveby.simulate(scenario=13),
+            "scenario is 13, it must be a whole number from 1 to 12",
+        ),
         (lambda: driveby.simulate(ei=[1.0, 0.5]), "gives 2 elements"),
         (lambda: driveby.simulate(ei=[0.0] * 7), "ei is 0, it must be from 0.001 to 1000"),
         (lambda: driveby.simulate(scenario=6, road="F"), 'road is "F"'),
@@ -519,6 +568,35 @@ def test_plot_draws_estimate_and_truth(
         (lambda: driveby.simulate(scenario=6, noise=-1.0), "noise is -1"),
         (lambda: driveby.simulate(scenario=6, direction="up"), 'direction is "up"'),
         (lambda: driveby.simulate(scenario=6, site="no.toml"), "no.toml: no such file"),
+        (lambda: driveby.simulate(scenario=6, site=3), "site is 3, it must be the name of a site"),
+        (lambda: driveby.simulate(scenario=6, seed=1.5), "seed is 1.5, it must be a whole number"),
+        (lambda: driveby.simulate(scenario="6"), 'scenario is "6", it must be a whole number'),
+        (lambda: driveby.simulate(scenario=6, noise="25"), 'noise is "25", it must be a number'),
+        (lambda: driveby.simulate(scenario=6, noise=None), "noise is None, it must be a number"),
+        (lambda: driveby.simulate(scenario=6, noise=[1]), "noise is [1], it must be a number"),
+        (lambda: driveby.simulate(scenario=6, speed="10"), 'speed is "10", it must be a number'),
+        (lambda: driveby.simulate(scenario=6, speed=(9, 10, 11)), "or a pair (start, end)"),
+        (lambda: driveby.simulate(ei=0.5), "ei is 0.5, it must be a ratio for each element"),
+        (lambda: driveby.simulate(ei="1,1"), 'ei is "1,1", it must be a ratio for each element'),
+        (lambda: driveby.simulate(ei=np.ones((1, 7))), "ei is a ndarray, it must be a ratio"),
+        (lambda: driveby.simulate(ei=[None] * 7), "ei is nan, it must be from 0.001"),
+        (lambda: driveby.identify("x", seed=1.5), "seed is 1.5, it must be a whole number"),
+        (lambda: driveby.identify("x", seed="1"), 'seed is "1", it must be a whole number'),
+        (lambda: driveby.identify("x", method=3), "method is 3, it must be one of pre"),
+        (lambda: driveby.identify(None), "source is None, it must be a recording"),
+        (lambda: driveby.identify([3]), "source is 3, it must be a recording"),
+        (lambda: driveby.read(["a.mcap"]), "source is ['a.mcap'], it must be a recording"),
+        (lambda: driveby.load_site(3), "site is of type int, it must be the name of a site file"),
+        (lambda: driveby.with_values("a", {}), "site is of type str, it must be what load_site()"),
+        (lambda: driveby.survey(paper_site(), crossings=2.5), "crossings is 2.5, it must be a"),
+        (lambda: driveby.survey(paper_site(), speed="9"), 'speed is "9", it must be a number'),
+        (lambda: driveby.survey(paper_site(), speed=[11, 9]), "speed is 9, it must be from 11"),
+        (lambda: driveby.survey(paper_site(), noise="9"), 'noise is "9", it must be a number'),
+        (lambda: driveby.fuse(3), "source is 3, it must be the name of a results file"),
+        (lambda: driveby.fuse(["a.json"]), "source is ['a.json'], it must be the name of a"),
+        (lambda: driveby.report(["a.json"]), "source is ['a.json'], it must be the name of a"),
+        (lambda: driveby.plot("a.json"), 'found is "a.json", it must be what identify() or'),
+        (lambda: driveby.plot_chains(3), "solution is 3, it must be what identify() returns"),
     ],
 )
 def test_wrong_input_gives_one_line(call: Callable[[], object], words: str) -> None:
@@ -583,6 +661,82 @@ def test_fused_bridge_is_that_of_the_command_line(tmp_path: Path) -> None:
         driveby.fuse()
 
 
+def of_estimates(*crossings: CrossingResult) -> Results:
+    return results(ResultHeader("1", 5.0, "0" * 16, {}, 1), list(crossings), {})
+
+
+def test_crossings_of_one_identifier_must_be_the_same(found: driveby.Identification) -> None:
+    """Of two crossings under one identifier all but one would be dropped."""
+    (one,) = found.results.crossings
+    assert one.parameters is not None
+    again = driveby.fuse(found, found.results, driveby.fuse(found))
+    assert again.bridges["bridge-1"].crossings_used == (one.crossing_id,)
+    changed = one.parameters | {"rhoA": one.parameters["rhoA"].model_copy(update={"mean": 1.0})}
+    other = of_estimates(one.model_copy(update={"parameters": changed}))
+    with pytest.raises(driveby.InputError) as caught:
+        driveby.fuse(found, other)
+    assert str(caught.value).startswith(f"{one.crossing_id}: two crossings with this identifier")
+    assert "simulation.started_at(" in str(caught.value)
+
+
+def test_stored_results_are_the_same_as_those_in_memory(
+    found: driveby.Identification, tmp_path: Path
+) -> None:
+    found.to_json(tmp_path / "found.json")
+    fused = driveby.fuse(found, tmp_path / "found.json")
+    assert len(fused.results.crossings) == 1
+
+
+def test_simulation_started_at_another_time_is_another_crossing(
+    simulation: driveby.Simulation, exact: driveby.Identification
+) -> None:
+    later = simulation.started_at("2026-05-01T09:30:00+02:00")
+    (solution,) = driveby.identify(later, method="least_squares").solutions
+    assert exact.solutions[0].crossing.crossing_id == "truck-1.bridge-1.20260101T000003.000Z"
+    assert solution.crossing.crossing_id == "truck-1.bridge-1.20260501T073003.000Z"
+    for start, words in (
+        ("2026-05-01T09:30:00", "which has no zone"),
+        ("1900-01-01T00:00:00Z", "it must be a time from 1970 to 2100"),
+        (3, "start is 3, it must be a time as 2026"),
+    ):
+        with pytest.raises(driveby.InputError, match=words) as caught:
+            simulation.started_at(start)  # type: ignore[arg-type]
+        assert str(caught.value).startswith("start")
+
+
+def test_plot_draws_a_fused_bridge(found: driveby.Identification, tmp_path: Path) -> None:
+    fused = driveby.fuse(found)
+    panel, *_ = driveby.plot(fused, bridge="bridge-1").axes
+    tops = sorted(f"{e.mean / 1e9:.2f}" for e in fused.bridges["bridge-1"].elements.values())
+    assert len(tops) == 7
+    assert panel.get_ylim()[1] > float(tops[-1])
+    before = driveby.plot(driveby.fuse(found, baseline=found)).axes[0].get_legend()
+    assert "baseline" in " ".join(text.get_text() for text in before.get_texts())
+    found.to_json(tmp_path / "found.json")
+    stored = driveby.fuse(tmp_path / "found.json")
+    for call in (driveby.plot, lambda one: driveby.report(one, output=tmp_path / "a.html")):
+        with pytest.raises(driveby.InputError, match="bridge-1: has no site file, fuse"):
+            call(stored)
+    drawn = driveby.plot(driveby.fuse(tmp_path / "found.json", site=found.site))
+    assert drawn.axes[0].get_ylim() == panel.get_ylim()
+    with pytest.raises(driveby.InputError, match='bridge is "x", it must be one of bridge-1'):
+        driveby.plot(fused, bridge="x")
+    with pytest.raises(driveby.InputError, match="truth is drawn with a single crossing"):
+        driveby.plot(fused, truth=driveby.simulate(scenario=6))
+
+
+def test_report_of_a_fused_bridge_has_its_numbers(
+    found: driveby.Identification, tmp_path: Path
+) -> None:
+    of_fused = driveby.report(driveby.fuse(found), output=tmp_path / "fused.html").read_text()
+    of_found = driveby.report(found, output=tmp_path / "found.html").read_text()
+    time = re.compile(r"[\d-]+ [\d:]+ UTC(?=</td>)")
+    named = of_fused.replace(">fusion; ", ">identification; ")
+    assert time.sub("", named) == time.sub("", of_found)
+    given = driveby.report(found, site=found.site, output=tmp_path / "site.html")
+    assert given.read_text() == of_found
+
+
 @pytest.mark.slow
 def test_survey_is_that_of_the_command_line(
     tmp_path: Path, project: Path, capsys: pytest.CaptureFixture[str]
@@ -593,7 +747,9 @@ def test_survey_is_that_of_the_command_line(
     found = driveby.survey(site, crossings=2, speed=10.0)
     assert json.loads(out.read_text()) == json.loads(json.dumps(found.as_dict()))
     assert repr(found) == capsys.readouterr().out.strip()
-    with pytest.raises(driveby.InputError, match="crossings is 0, it must be from 1 to 300"):
+    with pytest.raises(
+        driveby.InputError, match="crossings is 0, it must be a whole number from 1 to 300"
+    ):
         driveby.survey(site, crossings=0)
     with pytest.raises(driveby.InputError, match='road is "F", it must be one of A, B, C, D, E'):
         driveby.survey(site, road="F")
@@ -655,5 +811,9 @@ def test_diagnostic_plots_have_a_panel_for_each_parameter(found: driveby.Identif
     chains = driveby.plot_chains(solution, ["rhoA", "EI_4"]).axes
     assert [axes.get_title(loc="left") for axes in chains] == ["rhoA", "EI_4"]
     assert len(chains[0].lines) == len(solution.draws["rhoA"])
+    (alone,) = driveby.plot_posterior(found, names="rhoA").axes
+    assert alone.get_title(loc="left") == "rhoA"
     with pytest.raises(driveby.InputError, match="EI_9: is unknown"):
         driveby.plot_posterior(solution, ["EI_9"])
+    with pytest.raises(driveby.InputError, match=r"names is \[5\], it must be a list of names"):
+        driveby.plot_posterior(solution, [5])  # type: ignore[list-item]
