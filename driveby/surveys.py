@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from schemas.site import Site
 from services.common.errors import InputError
+from services.common.field_docs import with_field_docs
 from services.execution.blas import one_blas_thread
 from services.notebook.arguments import number, one_or_two, whole
 from services.notebook.read import Name, given_site
@@ -15,10 +16,12 @@ from services.planning.plan_survey import SurveyWishes, plan_survey
 from services.planning.survey import SurveyForecast
 
 
+@with_field_docs
 class SurveyPlan(NamedTuple):
     """Plan of a survey, with its expected accuracy and detection."""
 
     survey: SurveyForecast
+    """Expected accuracy and detection; `as_dict` returns its numbers."""
 
     def __repr__(self) -> str:
         """Return the lines that `driveby survey` prints."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from schemas.signals import AccelBatch, AccelChannel, GnssFix, in_order
 from schemas.site import Site
 from services.common.extras import check_installed
+from services.common.field_docs import with_field_docs
 from services.common.progress import Offset, no_progress
 from services.drives.importing import normalised_runs
 from services.drives.runs import Run
@@ -42,6 +43,7 @@ class FixSeries(NamedTuple):
     heading_deg: Floats  # clockwise from north, NaN where it is not known
 
 
+@with_field_docs
 class Signals(NamedTuple):
     """Measurements of one truck during one boot of its computer, or in one CSV run."""
 
@@ -54,6 +56,7 @@ class Signals(NamedTuple):
     channels: dict[str, ChannelSeries]
     """Series by name, `driveby.CHANNELS` first; a channel that the truck lacks is absent."""
     fixes: FixSeries
+    """Fixes of the GNSS receiver."""
 
     def __repr__(self) -> str:
         """Return one line: the arrays have 100,000 values."""

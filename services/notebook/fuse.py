@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 from schemas.results import BridgeResult, CrossingResult, Results, load_results, results_json
 from schemas.site import Site
 from services.common.errors import InputError
+from services.common.field_docs import with_field_docs
 from services.common.files import check_writable, write_atomically
 from services.common.kinds import RESULTS
 from services.execution.blas import one_blas_thread
@@ -24,6 +25,7 @@ RESULTS_EXPECTED: Final = (
 )
 
 
+@with_field_docs
 class Fusion(NamedTuple):
     """Fused estimates of bridges."""
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from schemas.site import Site
 from schemas.topics import Message
 from services.common.errors import InputError
+from services.common.field_docs import with_field_docs
 from services.drives.runs import run_to_messages
 from services.drives.signals import Signals, signals_of_run
 from services.execution.blas import one_blas_thread
@@ -36,6 +37,7 @@ _SCENARIOS: Final = 12
 _RATIOS: Final = "a ratio for each element, such as [1, 1, 0.4]"
 
 
+@with_field_docs
 class Simulation(NamedTuple):
     """A simulated crossing and the truth behind it."""
 

@@ -11,6 +11,7 @@ from schemas.results import CrossingResult, Parameter, Results, Verdict, results
 from schemas.site import Bridge, Site
 from services.common.errors import InputError
 from services.common.extras import check_installed
+from services.common.field_docs import with_field_docs
 from services.common.files import check_writable, write_atomically
 from services.common.kinds import RESULTS
 from services.history.draws import (
@@ -32,6 +33,7 @@ _STATISTICS = ("mean", "std", "q025", "q50", "q975")
 _SPREAD = ("std", "q025", "q975")
 
 
+@with_field_docs
 class Solution(NamedTuple):
     """Result of one crossing, by whichever method."""
 
@@ -87,13 +89,16 @@ class Solution(NamedTuple):
         return whole.isel(crossing=0) if whole.data_vars else whole
 
 
+@with_field_docs
 class Identification(NamedTuple):
     """Results of all crossings, in order of time."""
 
     solutions: tuple[Solution, ...]
+    """Result of each crossing, rejected ones included."""
     results: Results
     """Results with the fused estimate of each bridge, as in results.json."""
     site: Site
+    """Site file by which the crossings were identified."""
 
     def __repr__(self) -> str:
         """Return one line for each crossing, at most twenty."""

@@ -28,6 +28,7 @@ from schemas.signals import CHANNELS
 from schemas.topics import Message
 from services.cli import main as cli
 from services.common import extras
+from services.common.field_docs import with_field_docs
 from services.notebook import identify as identifying
 from services.notebook import simulate as simulating
 from services.recordings.recording import read_messages
@@ -93,6 +94,29 @@ def test_every_name_is_there_and_typed_as_what_it_is() -> None:
     assert driveby.__version__
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = driveby.nothing
+
+
+def test_help_explains_every_field() -> None:
+    """Python's own docstring of a field is "Alias for field number 0"."""
+    named = [
+        value for value in map(driveby.__getattr__, driveby.__all__) if hasattr(value, "_fields")
+    ]
+    assert len(named) == 6
+    for one in named:
+        for field in one._fields:
+            text = getattr(one, field).__doc__
+            assert text.endswith("."), f"{one.__name__}.{field}: {text}"
+    assert driveby.Solution.draws.__doc__ == (
+        "Draws of each parameter, arrays (chain, draw).\n\n"
+        "They are empty for a rejected crossing, without `draws=True`, and for methods without "
+        "draws\n(`least_squares`, `random_walk`)."
+    )
+
+
+def test_class_without_source_keeps_its_docstrings() -> None:
+    names: dict[str, Any] = {"__name__": "frozen"}
+    exec("from typing import NamedTuple\nclass One(NamedTuple):\n    a: int\n", names)  # noqa: S102
+    assert with_field_docs(names["One"]).a.__doc__ == "Alias for field number 0"
 
 
 # -- read
