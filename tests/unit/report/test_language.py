@@ -70,6 +70,7 @@ def test_english_alarms_in_a_report_are_those_of_the_alarm() -> None:
         assert alarm_sentence(one, ENGLISH) == one.sentence()
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_german_report_has_no_english_sentence(site: Site, tmp_path: Path) -> None:
     then = tmp_path / "then.json"
     then.write_text(results_json(results_of(site, some_crossing("a"), used="a")))

@@ -175,6 +175,7 @@ def test_before_and_after_stand_beside_each_other_with_the_change(
     assert "Repeat the survey in the same season" in found.text
 
 
+@pytest.mark.usefixtures("drawn")
 def test_wide_tables_and_figures_scroll_on_a_phone(site: Site) -> None:
     found = reported(site, results_of(site, some_crossing("a"), used="a"))
     facts = found.attributes.count(("class", "facts"))
@@ -314,6 +315,7 @@ def test_several_surveys_are_fused_and_other_campaigns_are_named(site: Site) -> 
     assert "The numbers below combine 3 of them;" in text
 
 
+@pytest.mark.usefixtures("drawn")
 @pytest.mark.parametrize(
     "bad", ["<script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "a & b < c", "$\\frac$"]
 )
@@ -330,6 +332,7 @@ def test_nothing_from_a_file_becomes_part_of_the_page(site: Site, bad: str) -> N
     assert bad in seen.text  # as words
 
 
+@pytest.mark.usefixtures("drawn")
 def test_it_needs_nothing_but_itself(site: Site) -> None:
     text = page(
         bridge_reports(
@@ -376,6 +379,7 @@ def written(tmp_path: Path, site: Site) -> tuple[Path, Path]:
     return tmp_path / "found.json", tmp_path / "site.toml"
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_command_writes_the_page_and_says_the_finding(
     capsys: pytest.CaptureFixture[str], written: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -490,7 +494,7 @@ def test_a_browser_that_prints_nothing_is_a_failure_with_the_page_left(
 
 
 @pytest.fixture
-def browser() -> str:
+def browser(drawn: None) -> str:
     """The browser that prints; without one the test is left out."""
     try:
         return pdf.find_browser()
