@@ -172,6 +172,12 @@ class Finder:
                 wait: _Wait = (lambda *_: False) if for_good else TruckBoot.has_hole
                 yield from self._search_stays(truck, list(truck.near), truck.latest_s, wait)
 
+    def settle(self, realm: str, vehicle: str, crossing_id: str) -> None:
+        """Ignore a detected crossing from now on: it was decided from a recording."""
+        for truck in self._boots_of(realm, vehicle):
+            if crossing_id in truck.detected.values():
+                truck.done.add(crossing_id)
+
     def has_undecided(self, realm: str, vehicle: str) -> bool:
         """Return whether a truck has, or may have, a crossing that is not decided."""
         return any(

@@ -198,6 +198,7 @@ class Engine:
         work = found.pending.work
         data, span_ns = work.data, (found.entry_ns, found.exit_ns)
         self._names.take(data, *span_ns)
+        self._finder.settle(data.realm, data.vehicle.id, data.crossing_id)
         seen = self._finder.scene.traffic.others(
             data.realm, data.bridge.id, data.vehicle.id, *span_ns
         )

@@ -96,6 +96,10 @@ class Worker:
     def feed(self, messages: list[Message]) -> list[CrossingResult]:
         return self._published(o for m in messages for o in self.engine.feed(m.key, m.payload))
 
+    def leave(self, *, for_good: bool) -> list[CrossingResult]:
+        """The truck is silent."""
+        return self._published(self.engine.gone(REALM, "truck-1", for_good=for_good))
+
     def go_on(self, times: int = 20) -> list[CrossingResult]:
         """The results of so many rounds, each long after the one before."""
         results = []
@@ -207,6 +211,51 @@ def test_what_the_truck_itself_sends_is_no_second_crossing(
     assert len(between.backfill._found) == 2
     assert ids(between.feed(TWO)) == IDS
     assert between.go_on() == []
+
+
+@pytest.mark.parametrize("restarts", [True, False])
+@pytest.mark.parametrize("has_spool", [True, False])
+def test_a_truck_lost_on_the_bridge_gives_one_result(
+    tmp_path: Path, record: Callable[..., Path], *, has_spool: bool, restarts: bool
+) -> None:
+    """Killed there, or out of reach: its recording decides, and it comes a quarter later."""
+    worker = Worker(tmp_path)
+    assert worker.feed(until(8.0)) == []
+    for for_good in (False, True):
+        assert worker.leave(for_good=for_good) == []
+    record(until(8.0))
+    assert ids(worker.go_on()) == IDS[:1]
+    if has_spool:
+        rest = [m for m in until(8.7) if m not in until(8.0)]
+        record(rest, "truck-1-20260101T000500Z.mcap")
+        assert worker.go_on() == []
+    later = [restarted(m) for m in until(20.0)] if restarts else TWO
+    found = ids(worker.feed(later))
+    assert IDS[0] not in found
+    assert len(found) == 1  # the next crossing
+    assert worker.go_on() == []
+
+
+def until(time_s: float) -> list[Message]:
+    """What a truck has sent by then."""
+    return [m for m in TWO if m.log_time_ns * 1e-9 - START_S < time_s]
+
+
+def restarted(message: Message) -> Message:
+    """The same a quarter of an hour later, in the truck's next boot."""
+    kinds: dict[str, type[pb.AccelBatch | pb.GnssFix]] = {
+        "accel": pb.AccelBatch,
+        "gnss": pb.GnssFix,
+    }
+    kind = kinds.get(message.key.stream)
+    boot_id, time_ns = message.boot_id + 1, message.log_time_ns + 900 * NS_PER_S
+    payload = message.payload
+    if kind is not None:
+        later = kind.FromString(payload)
+        later.boot_id = boot_id
+        later.wall_time_ns += 900 * NS_PER_S
+        payload = later.SerializeToString(deterministic=True)
+    return message._replace(boot_id=boot_id, log_time_ns=time_ns, payload=payload)
 
 
 def test_a_history_that_begins_on_the_bridge_is_left_to_the_recording(
