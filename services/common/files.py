@@ -7,6 +7,7 @@ being written: its writer would continue into an unlinked file.
 
 import errno
 import fcntl
+import glob
 import os
 import secrets
 from collections.abc import Iterator
@@ -120,6 +121,16 @@ def _temporary(path: Path) -> Path:
     if len(os.fsencode(name)) > _LONGEST_NAME:
         name = f".{token}.part{path.suffix}"
     return path.with_name(name)
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove temporary files next to `path` that killed writers left.
+
+    The caller makes sure that no process writes to `path` now.
+    """
+    pattern = f".{glob.escape(path.stem)}.{'[0-9a-f]' * 8}.part{glob.escape(path.suffix)}"
+    for left in path.parent.glob(pattern):
+        left.unlink(missing_ok=True)
 
 
 def _head(path: Path) -> bytes:

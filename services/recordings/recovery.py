@@ -13,7 +13,12 @@ from schemas.events import Event, EventKind, encode_event
 from schemas.messages import descriptors
 from schemas.topics import Key, check_realm, key, parse_key, topic
 from services.common.errors import FailureError, InputError
-from services.common.files import check_ordinary, check_writable, replaced_atomically
+from services.common.files import (
+    check_ordinary,
+    check_writable,
+    remove_leftovers,
+    replaced_atomically,
+)
 from services.common.interrupts import interrupts_held
 from services.common.intervals import Intervals
 from services.common.progress import Offset, no_progress
@@ -132,6 +137,8 @@ def recover_recording(
             ) from None
         if not any(not isinstance(item, Damage) for item in _read(source, file)):
             raise InputError(f"{source}: holds nothing of an MCAP recording that can be read")
+        if target == recovered_path(source):  # the lock of the source covers it
+            remove_leftovers(target)
         with contextlib.ExitStack() as renaming:
             with replaced_atomically(target, force=force) as temporary:
                 with temporary.open("wb") as out:

@@ -102,6 +102,22 @@ def test_what_crashed_is_recovered_and_set_aside(tmp_path: Path) -> None:
     assert kept(tmp_path)[0][1].text.startswith("truck-3.mcap")  # whose writer is gone now
 
 
+@pytest.mark.parametrize("name", ["truck-1", "_service"])
+def test_what_a_killed_recovery_left_is_removed(tmp_path: Path, name: str) -> None:
+    """The next logger recovers the recording again, also the one of services."""
+    day = tmp_path / "live" / DAY
+    path = day / f"{name}-20260101T000000Z.mcap"
+    crashed(path)
+    (day / f".{path.stem}.recovered.0123abcd.part.mcap").write_bytes(b"half")
+    others = [f".{path.stem}-2.recovered.0123abcd.part.mcap", f".{path.stem}.0123abcd.part.json"]
+    for other in others:
+        (day / other).write_bytes(b"half")
+    [(_, event)] = kept(tmp_path)
+    assert event.kind == EventKind.RECORDING_RECOVERED
+    recovered = [f"{path.stem}.recovered.mcap", f"{path.name}.crashed"]
+    assert sorted(p.name for p in day.iterdir()) == sorted([*others, *recovered])
+
+
 def test_no_room_to_recover_is_reported_and_changes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "live" / DAY / "truck-1.mcap"
     crashed(path)
