@@ -7,13 +7,17 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from services.common.errors import InputError
 from services.notebook.arguments import names_of
 from services.notebook.inference import prior_draws
 from services.notebook.solution import Identification, Solution, one_solution
-from services.viewer.drawing import STYLE
+from services.viewer.drawing import MUTED, STYLE, mark_bridge, simplify_axes
 
+Floats = NDArray[np.float64]
+
+_BRIDGE: Final = "#e3ebf0"
 _COLUMNS: Final = 4
 _BINS: Final = 60
 _SHOWN: Final = 6.0
@@ -25,25 +29,43 @@ _CUT: Final = (0.5, 99.5)
 def plot_residual(solution: Solution | Identification) -> Figure:
     """Draw the profile under the front wheel minus that under the rear wheel, over the chainage.
 
-    Long waves, the drift of twice integrated accelerations, have little weight in the fit. Raise
-    InputError for a crossing without a road profile.
+    Long waves, the drift of twice integrated accelerations, have little weight in the fit; a cubic
+    trend shows them. The RMS is given with and without it. Raise InputError for a crossing without
+    a road profile.
     """
     solution = one_solution("solution", solution, "plot_residual")
     road = solution.crossing.road
     if road is None:
         raise InputError(f"{solution.crossing.crossing_id}: has no road profile")
-    x_m = np.asarray(road.x_m)
+    x_m, bridge = np.asarray(road.x_m), solution.bridge
     difference_mm = 1e3 * (np.asarray(road.front_m) - np.asarray(road.rear_m))
+    trend_mm = np.polynomial.Polynomial.fit(x_m, difference_mm, 3)(x_m)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(8.0, 3.0), layout="constrained")
+        figure = Figure(figsize=(9.0, 3.3), layout="constrained")
         axes = figure.add_subplot()
-        axes.axvspan(0.0, solution.bridge.span_m, alpha=0.1, color="0.5", lw=0.0)
-        axes.plot(x_m, difference_mm, lw=0.8)
-        rms_mm = float(np.sqrt(np.mean(difference_mm**2)))
-        axes.set_title(f"profile mismatch, front minus rear: {rms_mm:.3g} mm RMS; bridge shaded")
-        axes.set_xlabel("chainage (m)")
-        axes.set_ylabel("mm")
+        mark_bridge(axes, (0.0, *bridge.interior_supports_m, bridge.span_m))
+        axes.patches[0].set(label="bridge", facecolor=_BRIDGE)
+        axes.axhline(0.0, color=MUTED, lw=0.8)
+        every, short = _rms(difference_mm), _rms(difference_mm - trend_mm)
+        axes.plot(
+            x_m,
+            difference_mm,
+            lw=0.8,
+            label=f"difference: {every:.2g} mm RMS, {short:.2g} without trend",
+        )
+        label = "cubic trend: mostly drift, little weight in the fit"
+        axes.plot(x_m, trend_mm, lw=1.2, ls="--", color="C1", label=label)
+        axes.set_title("Road profile under the front wheels minus that under the rear wheels")
+        axes.set_xlabel("chainage from the start of the bridge (m)")
+        axes.set_ylabel("front − rear (mm)")
+        simplify_axes(axes)
+        figure.legend(loc="outside lower center", ncols=3)
     return figure
+
+
+def _rms(values: Floats) -> float:
+    """Return the root mean square of values (n,)."""
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def plot_posterior(

@@ -825,8 +825,20 @@ def test_diagnostic_plots_have_a_panel_for_each_parameter(found: driveby.Identif
     (residual,) = driveby.plot_residual(solution).axes
     road = solution.crossing.road
     assert road is not None
-    drawn = residual.lines[0].get_ydata()
-    assert drawn == pytest.approx(1e3 * (np.array(road.front_m) - np.array(road.rear_m)))
+    difference_mm = 1e3 * (np.array(road.front_m) - np.array(road.rear_m))
+    drawn = {line.get_label().split(":")[0]: line.get_ydata() for line in residual.lines}
+    assert drawn["difference"] == pytest.approx(difference_mm)
+    assert np.polyfit(road.x_m, difference_mm - drawn["cubic trend"], 3) == pytest.approx(
+        0, abs=1e-9
+    )
+    residual.get_figure().draw_without_rendering()
+    (legend,) = residual.get_figure().legends
+    explained = {text.get_text() for text in legend.get_texts()}
+    assert "bridge" in explained
+    rms_mm = f"{np.sqrt(np.mean(difference_mm**2)):.2g} mm RMS"
+    assert any(text.startswith(f"difference: {rms_mm}, ") for text in explained)
+    box = legend.get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= residual.get_figure().bbox.width
     posterior = driveby.plot_posterior(solution).axes
     assert {axes.get_xlabel() for axes in posterior} == {"GN·m²"}
     low_gn, high_gn = posterior[3].get_xlim()
