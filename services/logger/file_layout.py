@@ -31,6 +31,11 @@ class RecordingTarget(NamedTuple):
     realm: str | None
     site_toml: str | None
 
+    @property
+    def top(self) -> Path:
+        """Folder that holds all recordings, at any depth."""
+        return self.folder if self.file is None else self.file.parent
+
 
 def file_of(place: RecordingTarget, message: Message, open_: Container[FileName]) -> FileName:
     """Return the file of a message; messages of services about a vehicle go to its open one."""

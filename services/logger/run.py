@@ -42,11 +42,12 @@ from services.logger.health_line import clock_note, health_line
 from services.logger.housekeeping import Housekeeping, RetentionPolicy
 from services.logger.intake import Intake
 from services.logger.memory import give_back_memory
+from services.logger.open_files import RotationLimits
 from services.logger.own_events import OwnEvents
 from services.logger.rate_limited_log import RateLimitedLog
 from services.logger.settings import LoggerSettings
 from services.logger.unlisted import UnlistedLog
-from services.logger.writer import FileWriter, RotationLimits, count_all
+from services.logger.writer import FileWriter, count_all
 
 _log = logging.getLogger(__name__)
 _ANNOUNCE_PERIOD_S = 0.1

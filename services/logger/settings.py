@@ -18,7 +18,7 @@ from services.common.options import (
 )
 
 if TYPE_CHECKING:
-    from services.logger.writer import RotationLimits
+    from services.logger.open_files import RotationLimits
 
 _ROOM = "files and disk space"
 
@@ -86,7 +86,7 @@ class LoggerSettings:
     @property
     def limits(self) -> "RotationLimits":
         """Limits of a file's age and size, and of free disk space."""
-        from services.logger.writer import RotationLimits
+        from services.logger.open_files import RotationLimits
 
         return RotationLimits(
             age_s=self.rotate_minutes * 60.0,

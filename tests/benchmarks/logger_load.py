@@ -36,8 +36,8 @@ from schemas.signals import (
     encode_accel,
 )
 from services.bus.session import open_session
+from services.logger.open_files import RotationLimits
 from services.logger.settings import LoggerSettings
-from services.logger.writer import RotationLimits
 from services.recordings.recording import read_identities, read_info
 from services.truck.gateway import Gateway
 from tests.parent import die_with_parent, parent_environment

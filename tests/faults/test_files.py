@@ -28,13 +28,14 @@ from schemas.signals import (
 from schemas.topics import Key, Message
 from services.common.disk import DISK, Disk
 from services.common.errors import FailureError
-from services.logger import file_layout
+from services.logger import file_layout, open_files
 from services.logger import run as logger
 from services.logger import writer as writer_module
 from services.logger.backlog import QUEUE_BYTES, Backlog
 from services.logger.file_layout import RecordingTarget
+from services.logger.open_files import RotationLimits
 from services.logger.settings import LoggerSettings
-from services.logger.writer import FileWriter, RotationLimits
+from services.logger.writer import FileWriter
 from services.recordings.recording import is_closed, read_info, read_messages
 from services.recordings.recovery import recover_recording
 from tests.waiting import LONGEST_S
@@ -442,7 +443,7 @@ def test_a_truck_that_is_quiet_gets_a_new_file_when_it_comes_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(writer_module, "SYNC_PERIOD_S", 0.01)
-    monkeypatch.setattr(writer_module, "QUIET_S", 0.2)
+    monkeypatch.setattr(open_files, "QUIET_S", 0.2)
     writer = FileWriter(place(tmp_path))
     writer.put(info("truck-1"))
     writer.put(next(fixes(1)))
