@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.crossing.residuals import SWING_MODES
+from pre_core.crossing.deflection import SWING_MODES
 from pre_core.parameters import EI_1, FIRST_OF_BRIDGE
 
 CHANNELS = 4

@@ -80,7 +80,7 @@ class NoisePath(NamedTuple):
     m_22: float
     m_12: float
     is_inertial: bool
-    """Computation of the tyre force, see `residuals.GriddedCrossing`."""
+    """Computation of the tyre force, see `arguments.GriddedCrossing`."""
     lead: Lead = NO_LEAD
     """Front axle of a truck with a tandem: then the masses above are not used, and the body has no
     equations."""

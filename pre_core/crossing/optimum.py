@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pre_core.crossing.comparison import is_better
+from pre_core.crossing.deflection import SWING_MODES
 from pre_core.crossing.fit import (
     FAR_OFF_CHI2,
     HOPELESS_CHI2,
@@ -51,7 +52,6 @@ from pre_core.crossing.preparation import (
     update_noise,
     with_line,
 )
-from pre_core.crossing.residuals import SWING_MODES
 from pre_core.crossing.rows import RESIDUALS
 from pre_core.crossing.walk import Placement, better_neighbour, scan_offsets, shifted_to
 from pre_core.physics.bridge import FloatArray

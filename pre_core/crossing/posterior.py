@@ -16,15 +16,13 @@ from scipy.linalg import qr, solve_triangular
 
 from pre_core.crossing import noise as _noise
 from pre_core.crossing import splines
+from pre_core.crossing.arguments import Buffers, EvaluationPoints, GriddedCrossing
+from pre_core.crossing.deflection import SWING_MODES
 from pre_core.crossing.layout import CHANNELS, ParameterLayout, parameter_layout
 from pre_core.crossing.lines import project_out
 from pre_core.crossing.mismatch import Mismatch, MismatchSpectra
 from pre_core.crossing.noise import NoisePath, force_masses, noise_path
 from pre_core.crossing.residuals import (
-    SWING_MODES,
-    Buffers,
-    EvaluationPoints,
-    GriddedCrossing,
     evaluate,
     evaluate_white,
     largest_deflections,

@@ -7,6 +7,7 @@ import numpy as np
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import lines
+from pre_core.crossing.arguments import EvaluationPoints, GriddedCrossing, allocate_buffers
 from pre_core.crossing.channels import A, GainsAndDelays, ModelSignals, channel_signals
 from pre_core.crossing.front_axle import without_front_axle
 from pre_core.crossing.mismatch import BridgePavement, Mismatch, mismatch_spectra
@@ -34,12 +35,7 @@ from pre_core.crossing.posterior import (
     starting_point,
     trajectory_basis,
 )
-from pre_core.crossing.residuals import (
-    EvaluationPoints,
-    GriddedCrossing,
-    allocate_buffers,
-    roads_and_deflections,
-)
+from pre_core.crossing.residuals import roads_and_deflections
 from pre_core.crossing.rows import RESIDUALS, row_count, row_filter
 from pre_core.crossing.step_tables import sinc_table, step_table
 from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_FACTOR

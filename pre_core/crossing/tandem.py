@@ -6,18 +6,14 @@ it follows from the profile that the tandem found at the same place (`lead_motio
 corrected as the estimate of truck and bridge improves.
 """
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.crossing.arguments import Buffers, GriddedCrossing
 from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_SPRING_N_PER_M
 from pre_core.kernels.lanes import Lanes, fma, fma_scalar, kernel, load, mul, store
 from pre_core.parameters import C_S1, C_U1, K_S1, K_U1, M_U1, SHARE
 from pre_core.physics.tandem import Lead, lead_response, own_springs, shared_load
-
-if TYPE_CHECKING:
-    from pre_core.crossing.residuals import Buffers, GriddedCrossing
 
 FloatArray = NDArray[np.float64]
 
@@ -68,8 +64,8 @@ def add_tyre_damping(
 
 @kernel
 def wheels(
-    crossing: "GriddedCrossing",
-    work: "Buffers",
+    crossing: GriddedCrossing,
+    work: Buffers,
     theta: FloatArray,
     gap: float,
     gravity: float,
@@ -118,8 +114,8 @@ def wheels(
 
 @kernel
 def _shared_force(
-    crossing: "GriddedCrossing",
-    work: "Buffers",
+    crossing: GriddedCrossing,
+    work: Buffers,
     theta: FloatArray,
     gap: float,
     transfer: float,
@@ -141,8 +137,8 @@ def _shared_force(
 
 @kernel
 def _own_forces(
-    crossing: "GriddedCrossing",
-    work: "Buffers",
+    crossing: GriddedCrossing,
+    work: Buffers,
     theta: FloatArray,
     gap: float,
     transfer: float,
@@ -201,7 +197,7 @@ def _value(c: tuple[Lanes, Lanes, Lanes, Lanes], x: float) -> Lanes:
 
 
 @kernel
-def advance(work: "Buffers", begin: int, stop: int) -> None:
+def advance(work: Buffers, begin: int, stop: int) -> None:
     """March all modes under three wheels, each in one part, over samples `begin` to `stop`.
 
     As `modal_response.advance` and `advance_with_ends`: `work.state` is updated and the deflections

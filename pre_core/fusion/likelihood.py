@@ -23,6 +23,7 @@ from scipy.linalg import cho_factor, cho_solve, qr
 
 from pre_core import parameters
 from pre_core.crossing import front_axle, posterior
+from pre_core.crossing.arguments import EvaluationPoints, GriddedCrossing
 from pre_core.crossing.compliances import (
     MISMATCH_BIAS_SPREAD,
     marginal,
@@ -34,7 +35,7 @@ from pre_core.crossing.fit import Optimum
 from pre_core.crossing.mismatch import CORRELATION_LENGTH_M, Mismatch, long_wave_power
 from pre_core.crossing.off_bridge import off_bridge_residuals
 from pre_core.crossing.preparation import replace_mismatch
-from pre_core.crossing.residuals import EvaluationPoints, GriddedCrossing, evaluate
+from pre_core.crossing.residuals import evaluate
 from pre_core.crossing.rows import RESIDUALS, filter_rows, row_count
 from pre_core.crossing.splines import basis
 from pre_core.crossing.whitening import project_out_noise, solve

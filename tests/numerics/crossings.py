@@ -10,15 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
+from pre_core.crossing.arguments import EvaluationPoints, GriddedCrossing, allocate_buffers
 from pre_core.crossing.channels import channel_signals
+from pre_core.crossing.deflection import SWING_MODES
 from pre_core.crossing.noise import no_suspension_noise, noise_path
-from pre_core.crossing.residuals import (
-    SWING_MODES,
-    EvaluationPoints,
-    GriddedCrossing,
-    allocate_buffers,
-    evaluate,
-)
+from pre_core.crossing.residuals import evaluate
 from pre_core.crossing.rows import row_count, row_filter
 from pre_core.crossing.step_tables import sinc_table, step_table
 from pre_core.crossing.whitening import white_rows, whitener

@@ -11,14 +11,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from pre_core.crossing.arguments import EvaluationPoints, GriddedCrossing, allocate_buffers
 from pre_core.crossing.channels import A, channel_signals
-from pre_core.crossing.residuals import (
-    SWING_MODES,
-    EvaluationPoints,
-    GriddedCrossing,
-    allocate_buffers,
-    roads_and_deflections,
-)
+from pre_core.crossing.deflection import SWING_MODES
+from pre_core.crossing.residuals import roads_and_deflections
 from pre_core.crossing.rows import row_filter
 from pre_core.kernels.lanes import LANES
 from pre_core.paper import experiment

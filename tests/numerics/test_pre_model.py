@@ -11,13 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
+from pre_core.crossing.arguments import EvaluationPoints, GriddedCrossing, allocate_buffers
 from pre_core.crossing.channels import A, V, Z
-from pre_core.crossing.residuals import (
-    EvaluationPoints,
-    GriddedCrossing,
-    allocate_buffers,
-    roads_and_deflections,
-)
+from pre_core.crossing.residuals import roads_and_deflections
 from pre_core.crossing.rows import row_filter
 from pre_core.paper import experiment
 from pre_core.parameters import ALPHA, BETA, C_U1, EI_1, K_ROT, K_U1, KAPPA, RHO_A, F

@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
-from pre_core.crossing.residuals import (
-    allocate_buffers,
-    roads_and_deflections,
-)
+from pre_core.crossing.arguments import allocate_buffers
+from pre_core.crossing.residuals import roads_and_deflections
 from pre_core.crossing.rows import row_filter
 from pre_core.parameters import ALPHA, C_S1, D_1, EI_1, K_S1, K_U1, KAPPA, M_U1, RHO_A
 from pre_core.physics import modal_response as piecewise_exact

@@ -11,7 +11,8 @@ import itertools
 import numpy as np
 import pytest
 
-from pre_core.crossing.residuals import GriddedCrossing, allocate_buffers, roads_and_deflections
+from pre_core.crossing.arguments import GriddedCrossing, allocate_buffers
+from pre_core.crossing.residuals import roads_and_deflections
 from pre_core.crossing.rows import row_filter
 from pre_core.paper import experiment
 from pre_core.parameters import TORSION
