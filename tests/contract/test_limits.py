@@ -1,8 +1,8 @@
 """The limits of the code's size, and what is beyond them today.
 
-A list below may only shrink. A test fails when something not listed is beyond its limit, when
-something listed has grown, and when it is within the limit, so that its line has to go. What is
-renamed or moved keeps its number, or a smaller one.
+`EXCEPTIONS` may only shrink. A test fails when something not listed is beyond its limit, when
+something listed has grown, when it is within the limit, so that its line has to go, and when it has
+no reason. What is renamed or moved keeps its number, or a smaller one.
 """
 
 import ast
@@ -28,32 +28,44 @@ ARGUMENTS = 7
 OFTEN = frozenset({"State", "Info", "Problem"})
 """Class names that each search has for itself."""
 
-LONG_MODULES: dict[str, int] = {}
 
-LONG_CLASSES: dict[str, int] = {}
+class Excess(NamedTuple):
+    """What is beyond a limit: its number, and the reason for leaving it so."""
 
-LONG_FUNCTIONS = {
-    "pre_core.physics.march:march": 140,
+    number: int
+    reason: str
+
+
+EXCEPTIONS: dict[str, dict[str, Excess]] = {
+    "lines of a module": {},
+    "lines of a class": {},
+    "lines of a function": {
+        "pre_core.physics.march:march": Excess(
+            140,
+            "The loop over the steps is one kernel over some thirty local arrays; every part of it "
+            "would take most of them as arguments.",
+        ),
+    },
+    "arguments": {
+        "services.notebook.simulate:simulate": Excess(
+            10,
+            "It is public as `driveby.simulate` and has the options of the command, all of them by "
+            "keyword.",
+        ),
+    },
+    "statements in a room's __init__": {
+        "pre_core": Excess(
+            5,
+            "Whatever is imported first of it must put off the parts of NumPy that SciPy would "
+            "load: a twentieth of a start, and 9 MB.",
+        ),
+    },
+    "classes of one name": {},
 }
-
-MANY_ARGUMENTS = {
-    "services.notebook.simulate:simulate": 10,
-}
-
-ROOMS_WITH_CODE = {
-    "pre_core": 5,
-}
-
-SHARED_NAMES: dict[str, int] = {}
-
-LISTS = {
-    "lines of a module": LONG_MODULES,
-    "lines of a class": LONG_CLASSES,
-    "lines of a function": LONG_FUNCTIONS,
-    "arguments": MANY_ARGUMENTS,
-    "statements in a room's __init__": ROOMS_WITH_CODE,
-    "classes of one name": SHARED_NAMES,
-}
+MOST_EXCEPTIONS = 3
+"""Number of exceptions; it may only shrink."""
+FEWEST_WORDS = 8
+"""Words of a reason."""
 
 
 class Module(NamedTuple):
@@ -113,7 +125,7 @@ def statements_of(tree: ast.Module) -> int:
 
 def measured(modules: list[Module]) -> dict[str, dict[str, int]]:
     """Return everything that is beyond a limit, by limit and name."""
-    found: dict[str, dict[str, int]] = {limit: {} for limit in LISTS}
+    found: dict[str, dict[str, int]] = {limit: {} for limit in EXCEPTIONS}
     classes: dict[str, int] = defaultdict(int)
 
     def note(limit: str, name: str, number: int, most: int) -> None:
@@ -139,14 +151,14 @@ def measured(modules: list[Module]) -> dict[str, dict[str, int]]:
     return found
 
 
-def beyond(found: Mapping[str, int], listed: Mapping[str, int]) -> list[str]:
+def beyond(found: Mapping[str, int], listed: Mapping[str, Excess]) -> list[str]:
     """Compare what is beyond a limit with the list of what may be."""
     return [
         *(f"{name}: is {found[name]}, beyond the limit" for name in sorted(found.keys() - listed)),
         *(
-            f"{name}: has grown from {listed[name]} to {found[name]}"
+            f"{name}: has grown from {listed[name].number} to {found[name]}"
             for name in sorted(found.keys() & listed)
-            if found[name] > listed[name]
+            if found[name] > listed[name].number
         ),
         *(
             f"{name}: is within the limit, remove its line"
@@ -155,18 +167,39 @@ def beyond(found: Mapping[str, int], listed: Mapping[str, int]) -> list[str]:
     ]
 
 
+def without_reason(listed: Mapping[str, Excess]) -> list[str]:
+    """Return the exceptions whose reason is not a sentence."""
+    return [
+        name
+        for name, (_, reason) in listed.items()
+        if len(reason.split()) < FEWEST_WORDS or not reason.endswith(".")
+    ]
+
+
 @pytest.fixture(scope="module")
 def of_ours(modules: list[Module]) -> dict[str, dict[str, int]]:
     return measured(modules)
 
 
-@pytest.mark.parametrize("limit", LISTS)
+@pytest.mark.parametrize("limit", EXCEPTIONS)
 def test_nothing_new_is_beyond_a_limit(limit: str, of_ours: dict[str, dict[str, int]]) -> None:
-    assert beyond(of_ours[limit], LISTS[limit]) == []
+    assert beyond(of_ours[limit], EXCEPTIONS[limit]) == []
+
+
+def test_exceptions_are_few_and_have_a_reason() -> None:
+    assert sum(map(len, EXCEPTIONS.values())) == MOST_EXCEPTIONS
+    assert [name for listed in EXCEPTIONS.values() for name in without_reason(listed)] == []
+
+
+def test_an_exception_without_a_reason_is_found() -> None:
+    sound = "Its parts would share nearly all of their arrays."
+    reasons = {"a": "", "b": "It is long.", "c": sound, "d": sound.removesuffix(".")}
+    listed = {name: Excess(70, reason) for name, reason in reasons.items()}
+    assert without_reason(listed) == ["a", "b", "d"]
 
 
 def test_a_list_may_only_shrink() -> None:
-    listed = {"a": 70, "b": 80, "c": 90}
+    listed = {name: Excess(number, "") for name, number in (("a", 70), ("b", 80), ("c", 90))}
     assert beyond({"a": 70, "b": 79, "c": 90}, listed) == []
     assert beyond({"a": 71, "b": 80, "d": 61}, listed) == [
         "d: is 61, beyond the limit",
@@ -198,13 +231,6 @@ def test_everything_beyond_a_limit_is_found() -> None:
     }
     longer = measured([module_of("services.room.one", f"{code}    c = 1\n    d = 2\n")])
     assert longer["lines of a class"] == {"services.room.one:A": 252}
-
-
-def test_a_long_module_says_why_it_is_one(modules: list[Module]) -> None:
-    for name, _, tree in modules:
-        if name in LONG_MODULES:
-            head = (ast.get_docstring(tree) or "").replace("\n", " ")
-            assert "This module is long" in head, name
 
 
 HEAVY = ("numba", "zenoh", "rerun", "matplotlib", "scipy", "pydantic", "numpy", "pandas", "xarray")
