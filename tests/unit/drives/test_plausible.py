@@ -9,7 +9,7 @@ from schemas.site_file import load_site
 from services.common.errors import InputError
 from services.drives.csv_import import read_folder
 from services.drives.plausible import check_plausible
-from services.drives.runs import GnssTrack, Run
+from services.drives.runs import Floats, GnssTrack, Run
 
 _METRE_DEG = 1.0 / 111_200.0
 
@@ -34,10 +34,10 @@ def test_contradicted_unit_or_order_is_refused(csv_example: Path, what: str) -> 
         check_plausible(changed(run, what), site)
 
 
-def driven(north_m: np.ndarray, west_m: np.ndarray, noise_m: float) -> GnssTrack:
+def driven(north_m: Floats, west_m: Floats, noise_m: float) -> GnssTrack:
     """Return fixes at 10 Hz with true speeds and with positions that scatter by `noise_m`."""
     rng = np.random.default_rng(1)
-    time_s = 1_790_000_000.0 + 0.1 * np.arange(north_m.size)
+    time_s = 1_790_000_000.0 + 0.1 * np.arange(north_m.size, dtype=np.float64)
     speed = np.hypot(np.gradient(north_m, 0.1), np.gradient(west_m, 0.1))
     north_m, west_m = (m + noise_m * rng.standard_normal(m.size) for m in (north_m, west_m))
     east_deg = _METRE_DEG / np.cos(np.radians(47.0))
