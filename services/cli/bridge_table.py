@@ -1,5 +1,6 @@
 """Printed tables of a bridge and its elements."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
 
@@ -8,6 +9,14 @@ from schemas.results import BridgeResult, ElementState, Parameter, Thirds, Third
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+
+_ENTRY = re.compile(r"\.(\d{8})T[\d.]+Z$")
+"""Entry time at the end of a crossing's name, with its day."""
+_NO_CHANGE = (
+    "all crossings are combined here; whether EI changed between them: driveby history, driveby "
+    "alarm check"
+)
 
 
 class BridgeElements(Protocol):
@@ -49,8 +58,15 @@ def print_bridge(console: "Console", bridge: BridgeElements, state: BridgeResult
     print_elements(console, bridge, state.elements, has_meaning, state.probability_of_loss)
     if state.finding is not None:
         console.print(f"[bold]the bridge:[/] {state.finding}", highlight=False)
+        if state.probability_of_loss is None and len(_days(state)) > 1:
+            console.print(_NO_CHANGE, highlight=False)
     for line in _of_state(state):
         console.print(line, highlight=False)
+
+
+def _days(state: BridgeResult) -> set[str]:
+    """Return the days of a state's crossings, as in their names."""
+    return {found[1] for name in state.crossings_used if (found := _ENTRY.search(name))}
 
 
 def level_lines(level: Parameter | ElementState, thirds: Thirds | ThirdsState) -> Iterator[str]:

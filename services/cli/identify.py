@@ -74,12 +74,12 @@ def identify_command(
         if asked.json is not None:
             write_atomically(asked.json, results_json(found))
         if asked.rrd is not None:
-            _write_rerun(asked.rrd, files, found, known, (asked.site or files[0]).parent, console)
+            _write_rerun(asked.rrd, found, request, (asked.site or files[0]).parent, console)
     if asked.figures is not None:
         from services.viewer.pictures import write_pictures
 
         with steps_bar(f"drawing into {asked.figures}", console) as drawn:
-            written = write_pictures(asked.figures, found, known, drawn)
+            written = write_pictures(asked.figures, found, known, drawn, request.fusing.baselines)
         line = f"{len(written)} pictures in {asked.figures}"
         console.print(line, highlight=False, soft_wrap=True)
     if asked.draws is not None:
@@ -179,18 +179,18 @@ def warn_of_no_noise(site: Site, method: str) -> None:
 
 def _write_rerun(
     path: Path,
-    recordings: list[Path],
     found: Results,
-    site: Site,
+    request: _IdentifyRequest,
     beside: Path,
     console: "Console",
 ) -> None:
-    """Write the Rerun file of the results; baselines are relative to `beside`."""
+    """Write the Rerun file of the results; baselines of the site file are relative to `beside`."""
     from services.viewer.bridge_view import views_of_bridges
     from services.viewer.rerun_file import RerunContent, write_rrd
     from services.viewer.residuals import residual_cells
     from services.viewer.vehicle_signals import signals_of_messages
 
+    recordings, site = request.recordings, request.site
     messages = chain.from_iterable(map(read_messages, recordings))
     with steps_bar("computing residuals", console) as progress:
         left = residual_cells(found.crossings, messages, site, progress)
@@ -203,7 +203,7 @@ def _write_rerun(
             replaced_atomically(path) as temporary,
             steps_bar(f"drawing {path.name}", console) as drawing,
         ):
-            states = views_of_bridges(found, site, beside)
+            states = views_of_bridges(found, site, beside, request.fusing.baselines)
             content = RerunContent(vehicles, found.crossings, site, states, left)
             write_rrd(temporary, content, drawing)
     except RuntimeError as error:  # Rerun's error for a file that cannot be written

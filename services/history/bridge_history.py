@@ -118,16 +118,25 @@ def statements(past: BridgeHistory, language: Language = ENGLISH) -> Iterator[St
     yield Statement(watch.words(language), watch.found_nothing)
     if watch.found_nothing:
         return
-    if past.comparison is None:
-        units = language.text(f"{past.unit}s")
-        yield Statement(language.text("change.unseen", units=units), is_reassuring=False)
-        return
-    sentence = _comparison_sentence(past.comparison, past.unit, language)
+    sentence = change_over_time(past, language)
+    if sentence is None:
+        sentence = language.text("change.unseen", units=language.text(f"{past.unit}s"))
     yield Statement(sentence, is_reassuring=False)
 
 
+def change_over_time(past: BridgeHistory, language: Language = ENGLISH) -> str | None:
+    """Return the sentence on the first and the last period; None where they are not compared."""
+    if past.comparison is None:
+        return None
+    return _comparison_sentence(past.comparison, past.unit, language)
+
+
 def _comparison_sentence(found: PeriodComparison, unit: Unit, language: Language) -> str:
-    times = {"first": period_name(found.first_s, unit), "last": period_name(found.last_s, unit)}
+    times = {
+        "first": period_name(found.first_s, unit),
+        "last": period_name(found.last_s, unit),
+        "how": language.text("change.how"),
+    }
     size = sorted(found.changes, key=_deviations, reverse=True)
     clear = [one for one in size if one.is_clear]
     if not clear:

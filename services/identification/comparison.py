@@ -205,7 +205,7 @@ def origin_of_state(state: BridgeResult) -> str:
     if used > 1:
         return f"Values from {used} fused crossings."
     if state.between_crossing_std is not None:
-        return "Values from one crossing; the intervals include the between-crossing variability."
+        return "One crossing, fused with the between-crossing variability, unlike its own figure."
     return "Values from one crossing."
 
 

@@ -14,6 +14,7 @@ from services.report.place import position_of
 
 def next_steps(report: BridgeReport, language: Language) -> Iterator[str]:
     """Yield the steps after a finding."""
+    yield from _alarms(report, language)
     match report.finding.kind:
         case "weak":
             yield from _inspect(report, language)
@@ -58,6 +59,14 @@ def advice_of_state(report: BridgeReport, language: Language) -> list[str]:
     """Return the advice on the reasons of the bridge's state."""
     state = report.view.state
     return [] if state is None else [language.bridge_advice[code] for code in state.reasons]
+
+
+def _alarms(report: BridgeReport, language: Language) -> Iterator[str]:
+    """Yield the elements that an active alarm concerns."""
+    alarms = () if report.past is None else report.past.alarms
+    numbers = sorted({alarm.element for alarm in alarms if alarm.acknowledged is None})
+    if numbers:
+        yield language.text("advice.alarm", elements=language.listed([str(n) for n in numbers]))
 
 
 def _inspect(report: BridgeReport, language: Language) -> Iterator[str]:

@@ -47,6 +47,7 @@ def cautions(measured: Measured, language: Language) -> Iterator[str]:
     """Yield the cautions on a finding, the most important one first."""
     if measured.view.estimate is None:
         return
+    yield from _same_crossings(measured, language)
     comparison = measured.view.comparison
     if comparison is not None:
         yield from _implausible(comparison, language)
@@ -84,6 +85,18 @@ def named_elements(numbers: Sequence[int], language: Language) -> str:
     """Return `element 3` or `elements 3 and 5`."""
     which = "caution.element" if len(numbers) == 1 else "caution.elements"
     return language.text(which, elements=language.listed([str(number) for number in numbers]))
+
+
+def _same_crossings(measured: Measured, language: Language) -> Iterator[str]:
+    """Yield how many crossings the baseline shares with the measurement compared with it."""
+    used = measured.view.used
+    common = used if measured.before is None else used & measured.before.used
+    if measured.before is None or not common:
+        return
+    if common == used == measured.before.used:
+        yield language.text("caution.same.all")
+    else:
+        yield language.choice("caution.same", len(common))
 
 
 def _implausible(comparison: Comparison, language: Language) -> Iterator[str]:

@@ -29,6 +29,8 @@ class Before(NamedTuple):
     verdict: str
     crossings: tuple[CrossingResult, ...]
     """Crossings that it includes, in order of time, as far as its file has them."""
+    used: frozenset[str] = frozenset()
+    """Ids of all crossings that it includes."""
 
 
 class SurveyFile(NamedTuple):
@@ -63,7 +65,8 @@ def before_of(
     state = stored.bridges[bridge.id]
     used = (one for one in stored.crossings if one.crossing_id in state.crossings_used)
     crossings = tuple(sorted(used, key=lambda crossing: crossing.entry_time))
-    return Before(name, estimate, state.verdict or "good", crossings)
+    ids = frozenset(state.crossings_used)
+    return Before(name, estimate, state.verdict or "good", crossings, ids)
 
 
 def combined_surveys(

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import matplotlib
 import numpy as np
 
-from schemas.alarms import Alarm
 from services.common.language import ENGLISH, Language, utc_day
 from services.history.bridge_history import BridgeHistory, statements
+from services.report.alarm_words import alarm_sentence
 from services.report.html import Html, inlined_svg, table, tag
 from services.viewer.drawing import STYLE, figure_bytes
 from services.viewer.history_figure import HistoryView, draw_history, history_view
@@ -76,19 +76,6 @@ def _alarms(past: BridgeHistory, language: Language) -> Iterator[Html]:
         yield tag(
             "p", wording.text, class_="reassuring" if wording.is_reassuring else "not-watched"
         )
-
-
-def alarm_sentence(alarm: Alarm, language: Language) -> str:
-    """Return an alarm in words; in English those of the alarm itself."""
-    ends = sorted(100.0 * abs(1.0 - end) for end in (alarm.ratio_q025, alarm.ratio_q975))
-    return language.text(
-        f"history.{alarm.direction}",
-        element=alarm.element,
-        change=100.0 * abs(1.0 - alarm.ratio),
-        since=utc_day(alarm.since),
-        low=ends[0],
-        high=ends[1],
-    )
 
 
 def _elements(drawn: HistoryView, language: Language) -> Html:

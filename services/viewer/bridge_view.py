@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -68,18 +70,28 @@ class BridgeView(NamedTuple):
         return comparison.ambiguous_neighbours(self.comparison, self.unresolved)
 
 
-def views_of_bridges(results: Results, site: Site, folder: Path | None = None) -> list[BridgeView]:
+def views_of_bridges(
+    results: Results,
+    site: Site,
+    folder: Path | None = None,
+    baselines: Mapping[str, BridgeResult] = MappingProxyType({}),
+) -> list[BridgeView]:
     """Return the view of every bridge of the site that was crossed.
 
-    With a `folder` the baselines that the site file names are read from there; raise InputError if
-    one does not fit.
+    `baselines` are stored states by bridge. With a `folder` those of other bridges that the site
+    file names are read from there; raise InputError if one does not fit.
     """
     crossed = {crossing.bridge for crossing in results.crossings}
-    return [
-        view_of_bridge(b, results, None if folder is None else named_baseline(b, folder)[0])
-        for b in site.bridges
-        if b.id in crossed
-    ]
+    views = []
+    for bridge in site.bridges:
+        if bridge.id in crossed:
+            stored = None
+            if bridge.id in baselines:
+                stored = estimate_of_state(baselines[bridge.id])
+            elif folder is not None:
+                stored = named_baseline(bridge, folder)[0]
+            views.append(view_of_bridge(bridge, results, stored))
+    return views
 
 
 def describe_bridge(view: BridgeView, language: Language = ENGLISH) -> list[str]:

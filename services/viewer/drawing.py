@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from services.common.files import write_atomically
 from services.common.language import ENGLISH, Language
@@ -306,6 +306,7 @@ def add_ratio_axis(axes: Axes, nominal: FloatArray, language: Language = ENGLISH
     ratio.set_ylabel(language.text("figure.ratio"))
     ratio.spines[:].set_visible(False)
     ratio.yaxis.set_major_locator(MaxNLocator(nbins=8, steps=[1, 2, 5, 10]))
+    ratio.yaxis.set_major_formatter(LocalisedNumbers(language))
     ratio.tick_params(length=0)
 
 
@@ -335,6 +336,19 @@ def simplify_axes(axes: Axes) -> None:
     if len(axes.get_yticks()):
         axes.yaxis.set_major_locator(MaxNLocator(nbins=5, steps=[1, 2, 2.5, 5, 10]))
     axes.tick_params(length=3)
+
+
+class LocalisedNumbers(ScalarFormatter):
+    """Numbers with the decimals that all ticks need, and the decimal sign of a language."""
+
+    def __init__(self, language: Language) -> None:
+        super().__init__(useOffset=False, useLocale=False)
+        self._has_decimal_comma = language.has_decimal_comma
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """Return the label of a tick."""
+        label: str = super().__call__(x, pos)
+        return label.replace(".", ",") if self._has_decimal_comma else label
 
 
 def simplify_numbers(axes: Axes, language: Language) -> None:

@@ -116,7 +116,7 @@ def draw_crossing(
 
 def _draw_heading(figure: Figure, crossing: CrossingView) -> None:
     inch = 1.0 / figure.get_figheight()
-    title = "Bridge stiffness and road profile from one crossing"
+    title = "Stiffness and road profile from one crossing alone (not fused)"
     figure.text(LEFT, 1.0 - 0.18 * inch, title, fontsize=14, fontweight="bold", va="top")
     summary = textwrap.shorten(summary_line(crossing), width=105, placeholder=" …")
     small: dict[str, Any] = {"fontsize": 9.5, "color": MUTED, "va": "top"}

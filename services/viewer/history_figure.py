@@ -30,6 +30,7 @@ from services.viewer.drawing import (
     STYLE,
     WEAK_EDGE,
     WIDTH_IN,
+    LocalisedNumbers,
     write_figure,
 )
 
@@ -272,6 +273,7 @@ def _draw_temperature(axes: Axes, history: HistoryView, language: Language) -> N
         color="#CC79A7", marker="o", markersize=2.5, linewidth=1.0,
     )  # fmt: skip
     axes.set_ylabel("°C", rotation=0, ha="right", va="center", labelpad=6)
+    axes.yaxis.set_major_formatter(LocalisedNumbers(language))
     axes.yaxis.tick_right()
     axes.grid(color=GRID, linewidth=0.8)
     _over_time(axes, language)

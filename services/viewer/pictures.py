@@ -1,9 +1,11 @@
 """A folder of figures: every crossing and every bridge of results, as PNG and as SVG."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
-from schemas.results import Results
+from schemas.results import BridgeResult, Results
 from schemas.site import Site
 from services.common.files import make_folder
 from services.common.progress import Steps, no_step_progress
@@ -16,15 +18,19 @@ FORMS = ("png", "svg")
 
 
 def write_pictures(
-    folder: Path, results: Results, site: Site, progress: Steps = no_step_progress
+    folder: Path,
+    results: Results,
+    site: Site,
+    progress: Steps = no_step_progress,
+    baselines: Mapping[str, BridgeResult] = MappingProxyType({}),
 ) -> list[Path]:
     """Write `CROSSING.png`, `BRIDGE.png` and the same as `.svg`; return them.
 
     The folder is created if absent, files of these names are replaced. `progress` is called for
-    each figure.
+    each figure. `baselines` are stored states, by bridge, that its figure shows.
     """
     make_folder(folder)
-    bridges = views_of_bridges(results, site)
+    bridges = views_of_bridges(results, site, baselines=baselines)
     steps = len(FORMS) * (len(results.crossings) + len(bridges))
     written: list[Path] = []
     for crossing in results.crossings:

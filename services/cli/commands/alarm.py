@@ -28,6 +28,7 @@ _WHAT = ("check", "list", "ack", "serve")
 _MAX_LINES = 20
 """Maximum number of listed bridges without monitoring."""
 _HOW = (
+    "an alarm compares periods; identify and fuse combine all crossings, which hides a change\n"
     "see it: driveby history BRIDGE --period week --figures DIR; inspect the bridge, then "
     "acknowledge the alarm: driveby alarm ack BRIDGE --by NAME --note TEXT"
 )

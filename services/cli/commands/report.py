@@ -77,7 +77,7 @@ def _report(asked: ReportOptions) -> int:
     language = language_of(asked.language)
     reports = bridge_reports(files, asked.baseline, beside, language)
     if asked.history is not None:
-        reports = with_histories(reports, asked.history, asked.period, print)
+        reports = with_histories(reports, asked.history, asked.period, print, language)
     with steps_bar(f"drawing {output}") as progress:
         text = page(reports, progress, language)
     write_atomically(output, text)

@@ -39,3 +39,17 @@ def test_a_recording_is_refused_with_what_is_wanted(
     error = capsys.readouterr().err
     assert f"driveby identify {recording} --json RESULTS.json makes them" in error
     assert error.count("\n") == 1
+
+
+def test_combined_days_name_the_commands_that_show_a_change(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for second, is_said in (("20260101T120000.000Z", False), ("20260102T110000.000Z", True)):
+        names = [f"truck-1.bridge-1.{entry}" for entry in ("20260101T110000.000Z", second)]
+        some = [
+            crossing(n).model_copy(update={"crossing_id": name}) for n, name in enumerate(names)
+        ]
+        path = write(tmp_path / "r.json", some)
+        assert main(["fuse", str(path)]) == 0
+        out = " ".join(capsys.readouterr().out.split())
+        assert ("whether EI changed between them: driveby history" in out) is is_said

@@ -9,14 +9,20 @@ import numpy as np
 import pytest
 from matplotlib import rc_context
 
+from schemas.alarms import Acknowledgement
 from schemas.reasons import REASON_TEXTS, Reason
 from schemas.results import Results, results_json
 from schemas.site import Site
 from services.common.language import LANGUAGES, language_of
-from services.report.bridge import BridgeReport, bridge_reports
+from services.history.bridge_history import BridgeHistory, ElementChange, PeriodComparison
+from services.history.watch_files import MonitoringState
+from services.report.advice import next_steps
+from services.report.bridge import BridgeReport, bridge_reports, with_history
 from services.report.earlier import season_of
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.drawing import STYLE
+from tests.unit.history.test_bridge_history import alarm
+from tests.unit.history.test_history_store import BEGIN_S
 from tests.unit.report.test_report import KNOWN, Seen, fused, reported, site
 from tests.unit.viewer.found import RATIOS, results_of, some_crossing
 
@@ -200,6 +206,62 @@ def test_combined_surveys_are_announced_with_the_command(site: Site, then: Path)
     assert "identify each into a results file of its own, then run driveby report LATER" in text
     assert "combined" not in first_page(reported(site, *surveys(site, 3.0 * 86400.0)))
     assert "are combined" not in first_page(reported(site, first, second, baseline=then))
+
+
+def test_comparison_of_the_same_crossings_is_announced(site: Site, tmp_path: Path) -> None:
+    path = tmp_path / "same.json"
+    results = results_of(site, some_crossing("a"), used="a")
+    path.write_text(results_json(results))
+    text = first_page(reported(site, results, baseline=path))
+    assert "The baseline has the same crossings: a measurement is compared with itself" in text
+    more = results_of(site, some_crossing("a"), some_crossing("b", entry=60.0), used="b")
+    state = more.bridges["bridge-1"].model_copy(update={"crossings_used": ("a", "b")})
+    more = more.model_copy(update={"bridges": {"bridge-1": state}})
+    text = first_page(reported(site, more, baseline=path))
+    assert "One of these crossings is in the baseline, too: a change is understated" in text
+    other = results_of(site, some_crossing("b"), used="b")
+    assert "crossings is" not in first_page(reported(site, other, baseline=path))
+
+
+def history_of() -> BridgeHistory:
+    """A history of two months, of which the second has a weaker element 4."""
+    changes = (ElementChange(4, 0.72, 0.65, 0.8), ElementChange(5, 1.0, 0.9, 1.1))
+    compared = PeriodComparison(BEGIN_S, BEGIN_S + 40 * 86_400.0, changes)
+    watch = MonitoringState("never_checked", None)
+    return BridgeHistory("bridge-1", "sim", "month", (), (), watch, compared)
+
+
+@pytest.mark.parametrize("code", LANGUAGES)
+def test_finding_names_the_change_over_time(site: Site, tmp_path: Path, code: str) -> None:
+    language, past = language_of(code), history_of()
+    found = report_on(site, results_of(site, some_crossing("a"), used="a", ratios=np.ones(7)))
+    first, *_ = with_history(found, past, language).cautions
+    assert language.text("caution.others", over_time="") in f"{first} "
+    assert language.number(-28.0, "+.0f") in first
+    assert "--baseline" in first
+    path = tmp_path / "then.json"
+    path.write_text(results_json(results_of(site, some_crossing("b"), used="b")))
+    before = report_on(site, results_of(site, some_crossing("a"), used="a"), baseline=path)
+    first, *_ = with_history(before, past, language).cautions
+    assert first.startswith(language.text("caution.baseline", over_time=""))
+
+
+def test_active_alarm_takes_reassurance_from_a_report(site: Site, tmp_path: Path) -> None:
+    past = history_of()._replace(alarms=(alarm(),))
+    found = report_on(site, results_of(site, some_crossing("a"), used="a", ratios=np.ones(7)))
+    assert found.finding.kind == "sound"
+    shown = with_history(found, past, language_of("en"))
+    assert shown.finding.kind == "open"
+    assert "But an alarm is active: element 4 is 20 % less stiff" in shown.finding.headline
+    assert shown.cautions[0].startswith("The alarm compares periods of the history.")
+    first, *others = next_steps(shown, language_of("en"))
+    assert first.startswith("Have element 4 inspected because of the active alarm")
+    assert not any("calls for no additional inspection" in step for step in others)
+    noted = alarm().model_copy(
+        update={"acknowledged": Acknowledgement(by="A", time=BEGIN_S, note="")}
+    )
+    quiet = with_history(found, past._replace(alarms=(noted,)), language_of("en"))
+    assert quiet.finding == found.finding
 
 
 def with_ends(results: Results, sprung: float, giving: float) -> Results:

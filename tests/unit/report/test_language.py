@@ -1,8 +1,10 @@
 """Languages of the report: complete, with the same values, and nothing left in English."""
 
+import re
 import string
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pytest
 
@@ -12,9 +14,14 @@ from schemas.site import Site
 from services.common.language import ENGLISH, LANGUAGES, Language, language_of
 from services.history.bridge_history import bridge_history
 from services.history.history_store import add_results
+from services.report.alarm_words import alarm_sentence
 from services.report.bridge import bridge_reports
-from services.report.history_section import alarm_sentence, history_section
+from services.report.history_section import history_section
 from services.report.page import page
+from services.viewer.bridge_figure import draw_bridge
+from services.viewer.bridge_view import view_of_bridge
+from services.viewer.crossings_figure import draw_crossings
+from services.viewer.drawing import STYLE, figure_bytes
 from services.viewer.history_figure import draw_history, history_view
 from tests.unit.history.test_bridge_history import alarm
 from tests.unit.history.test_history_store import crossings
@@ -122,6 +129,26 @@ def test_history_of_a_german_report_is_german(tmp_path: Path) -> None:
     axes[-1].figure.canvas.draw()
     assert "März" in " ".join(label.get_text() for label in axes[-1].get_xticklabels())
     assert next(text.get_text() for text in axes[3].texts) == "weniger steif"
+
+
+def test_axes_of_german_figures_have_a_decimal_comma(site: Site, tmp_path: Path) -> None:
+    found = results_of(site, some_crossing("a"), some_crossing("b", entry=60.0), used="b")
+    view = view_of_bridge(site.bridges[0], found, None)
+    add_results(tmp_path, crossings(34))
+    past = history_view(bridge_history(tmp_path, "sim-fleet", "bridge-1", "month", print))
+    warm = [p._replace(temperature_deg_c=7.0 + 0.7 * n) for n, p in enumerate(past.points)]
+    with matplotlib.rc_context(STYLE):
+        figures = [
+            draw_bridge(view, with_heading=False, language=GERMAN),
+            draw_crossings(list(enumerate(view.crossings, start=1)), GERMAN),
+            draw_history(past._replace(points=tuple(warm)), with_heading=False, language=GERMAN),
+        ]
+    for figure in figures:
+        # Text is drawn as paths, with the words in comments.
+        svg = figure_bytes(figure, "svg").decode()
+        texts = re.findall("<!-- (.*?) -->", svg)
+        assert [text for text in texts if re.search(r"\d\.\d", text)] == []
+        assert any(re.search(r"\d,\d", text) for text in texts)
 
 
 def test_the_page_names_its_language(site: Site) -> None:

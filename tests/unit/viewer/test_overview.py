@@ -101,7 +101,7 @@ def test_the_overview_has_the_picture_of_the_bridge_and_the_finding(
         (
             ("a",),
             0.02,
-            "Values from one crossing; the intervals include the between-crossing variability.",
+            "One crossing, fused with the between-crossing variability, unlike its own figure.",
         ),
         (("a",), None, "Values from one crossing."),
         (("a", "b"), 0.02, "Values from 2 fused crossings."),

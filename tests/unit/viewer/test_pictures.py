@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.patches import Rectangle
 
-from schemas.results import CrossingResult, Results
+from schemas.results import CrossingResult, Results, results_json
 from schemas.site import Site
 from schemas.site_file import load_site
 from services.cli import main as cli
@@ -179,6 +179,20 @@ def test_identify_draws_what_it_found(
     assert "is a file" in capsys.readouterr().err
 
 
+def test_identify_draws_the_baseline_that_it_compares_with(
+    tmp_path: Path, site: Site, project: Path
+) -> None:
+    recording, folder = project / "tests/data/noise_free.mcap", tmp_path / "pictures"
+    then = tmp_path / "then.json"
+    then.write_text(results_json(results_of(site, some_crossing("a"), used="a")))
+    options = ("--method", "least-squares", "--figures", str(folder))
+    command = ["identify", str(recording), *options, "--baseline", str(then)]
+    assert cli.main(command) == 0
+    svg = (folder / "bridge-1.svg").read_text()
+    assert "<!-- baseline -->" in svg
+    assert "<!-- Flexural rigidity EI (numbers: change from the baseline) -->" in svg
+
+
 def test_results_of_a_bridge_without_its_state_are_drawn(site: Site) -> None:
     results = results_of(site, some_crossing("a"))
     assert isinstance(results, Results)
@@ -190,6 +204,7 @@ def test_a_good_crossing_says_what_is_weak_and_by_how_much(site: Site) -> None:
     figure = draw_crossing(view, element_truth=None, road_truth=None)
     text = written(figure)
     assert "60 % less" in text
+    assert "from one crossing alone (not fused)" in text
     assert "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements" in text
     assert_words_apart(figure)
     sound = results_of(site, some_crossing("a"), ratios=np.ones(7)).crossings[0]
