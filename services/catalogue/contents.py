@@ -4,11 +4,14 @@ One pass over the file. A crossing is a stay on a bridge of the site file, detec
 as the worker does it; whether it can be identified is another question.
 """
 
-from collections.abc import Callable, Iterable
+from array import array
+from collections.abc import Callable, Iterable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
+
+import numpy as np
 
 from schemas.signals import NS_PER_S
 from schemas.site import Site
@@ -19,7 +22,7 @@ from services.common.intervals import Intervals
 from services.common.progress import Offset, no_progress
 from services.finding.bridges import Bridges, DetectedCrossing, detect_crossings
 from services.finding.drive import DriveMessages, Drives
-from services.finding.streams import boot_of
+from services.finding.streams import batch_extent, boot_of, missing_samples
 from services.recordings.recording import RecordingInfo, read_info
 
 LONGEST_SILENCE_S = 1.0
@@ -33,6 +36,17 @@ class Gap(NamedTuple):
     stream: str
     begin_ns: int
     end_ns: int
+
+
+class SampleGaps(NamedTuple):
+    """Missing samples of a truck's accelerations within its boots; each costs a crossing it meets.
+
+    A rejected crossing has the reason `gap_on_bridge`.
+    """
+
+    number: int = 0
+    total_s: float = 0.0
+    longest_s: float = 0.0
 
 
 class StreamSummary(NamedTuple):
@@ -56,6 +70,7 @@ class TruckSummary(NamedTuple):
     streams: dict[str, StreamSummary]
     channel_rates_hz: dict[str, float]
     """Declared rate of each accelerometer, Hz."""
+    sample_gaps: SampleGaps = SampleGaps()
 
 
 class RecordingSummary(NamedTuple):
@@ -89,6 +104,7 @@ def summarise_recording(
     otherwise ignored.
     """
     streams: dict[tuple[Key, int], _StreamArrivals] = {}
+    extents: dict[tuple[Key, int], _Extents] = {}
     drives = Drives(most_batches=1)
 
     def note(message: Message) -> None:
@@ -97,6 +113,8 @@ def summarise_recording(
         arrivals = streams.setdefault((where, message.boot_id), _StreamArrivals([], Intervals()))
         if arrivals.sequences.add(message.sequence):
             arrivals.times_ns.append(message.log_time_ns)
+            if where.owner == "vehicle" and where.stream == "accel":
+                extents.setdefault((where, message.boot_id), _Extents()).add(message)
         drives.add(message)
 
     info = read_info(path, note, progress)
@@ -110,7 +128,7 @@ def summarise_recording(
         site_error,
         min(times, default=info.first_time_ns),
         max(times, default=info.last_time_ns),
-        _trucks(streams, _rates(drives.all())),
+        _trucks(streams, _rates(drives.all()), _sample_gaps(extents)),
         _gaps(streams),
         () if known is None else _passings(known, drives.all()),
     )
@@ -119,6 +137,48 @@ def summarise_recording(
 class _StreamArrivals(NamedTuple):
     times_ns: list[int]
     sequences: Intervals
+
+
+class _Extents:
+    """Extents of the batches of one boot, in arrays: a day has a million batches."""
+
+    def __init__(self) -> None:
+        self._sequences, self._times_ns, self._sizes = array("q"), array("q"), array("q")
+        self._rate_hz = 0.0
+
+    def add(self, message: Message) -> None:
+        """Add a message; ignore a malformed one."""
+        try:
+            extent = batch_extent(message.payload)
+        except ValueError:
+            return
+        self._rate_hz = max(self._rate_hz, extent.rate_hz)
+        self._sequences.append(message.sequence)
+        self._times_ns.append(extent.device_time_ns)
+        self._sizes.append(extent.samples)
+
+    def gaps_s(self) -> list[float]:
+        """Return the lengths of the gaps between samples, s."""
+        if not self._sequences:
+            return []
+        columns = (np.array(one) for one in (self._sequences, self._times_ns, self._sizes))
+        table = np.column_stack(list(columns))
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        missing = missing_samples(*table.T, self._rate_hz)
+        return [float(number) / self._rate_hz for number in missing[missing > 0]]
+
+
+def _sample_gaps(
+    extents: Mapping[tuple[Key, int], _Extents],
+) -> dict[tuple[str, str], SampleGaps]:
+    """Return the gaps of samples by realm and vehicle."""
+    lengths: dict[tuple[str, str], list[float]] = {}
+    for (where, _), one in extents.items():
+        lengths.setdefault((where.realm, where.identifier), []).extend(one.gaps_s())
+    return {
+        truck: SampleGaps(len(some), sum(some), max(some, default=0.0))
+        for truck, some in lengths.items()
+    }
 
 
 def _rates(drives: Iterable[DriveMessages]) -> dict[tuple[str, str], dict[str, float]]:
@@ -145,7 +205,9 @@ def _own_site(path: Path, text: str | None) -> tuple[Site | None, str | None]:
 
 
 def _trucks(
-    streams: dict[tuple[Key, int], _StreamArrivals], rates: dict[tuple[str, str], dict[str, float]]
+    streams: dict[tuple[Key, int], _StreamArrivals],
+    rates: dict[tuple[str, str], dict[str, float]],
+    gaps: Mapping[tuple[str, str], SampleGaps],
 ) -> tuple[TruckSummary, ...]:
     by_truck: dict[tuple[str, str], dict[tuple[str, int], _StreamArrivals]] = {}
     for (where, boot_id), arrivals in streams.items():
@@ -169,6 +231,7 @@ def _trucks(
                     for name in names
                 },
                 rates.get((realm, vehicle), {}),
+                gaps.get((realm, vehicle), SampleGaps()),
             )
         )
     return tuple(found)

@@ -274,6 +274,43 @@ def device_time_ns(stream: str, payload: bytes) -> int:
     return message.device_time_ns
 
 
+class BatchExtent(NamedTuple):
+    """Time, rate and number of samples of a batch's fastest channel."""
+
+    device_time_ns: int
+    rate_hz: float
+    samples: int
+
+
+def batch_extent(payload: bytes) -> BatchExtent:
+    """Return the extent of an `accel` message; ValueError if it is malformed or has no samples."""
+    message = pb.AccelBatch()
+    try:
+        message.ParseFromString(payload)
+    except DecodeError as error:
+        raise ValueError(f"not an AccelBatch: {error}") from None
+    channels = [(one.rate_hz, len(one.acceleration_m_per_s2)) for one in message.channels]
+    rate_hz, samples = max(channels, default=(0.0, 0))
+    if not (0.0 < rate_hz < np.inf and samples):
+        raise ValueError("an AccelBatch without samples")
+    return BatchExtent(message.device_time_ns, rate_hz, samples)
+
+
+def missing_samples(
+    sequences: NDArray[np.int64],
+    times_ns: NDArray[np.int64],
+    sizes: NDArray[np.int64],
+    rate_hz: float,
+) -> NDArray[np.int64]:
+    """Return the number of samples missing after each batch but the last, as identification does.
+
+    `sequences`, `times_ns` and `sizes` (b,), b ≥ 1, are in order of `sequences`.
+    """
+    at = (times_ns - times_ns[0]) * (rate_hz / NS_PER_S)
+    numbers = _numbers(at, sizes.tolist(), sequences.tolist())
+    return np.maximum(np.diff(numbers) - sizes[:-1], 0)
+
+
 class _Grid(NamedTuple):
     start_s: float
     rate_hz: float

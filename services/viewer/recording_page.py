@@ -52,6 +52,11 @@ def recording_page(found: RecordingSummary) -> str:
     for truck in found.trucks:
         lines.append(f"- {_truck(truck)}")
         lines += [f"  - {line}" for line in _sensors(truck, found.site)]
+        if truck.sample_gaps.number:
+            lines.append(
+                f"  - gaps in the samples: {truck.sample_gaps.number}, the longest "
+                f"{truck.sample_gaps.longest_s:.3g} s"
+            )
     if found.site is None:
         lines.append(f"- {found.site_error or 'No site file in it: its bridges are not known.'}")
     else:

@@ -14,7 +14,7 @@ from services.common.options import flag, positional, site_option
 
 if TYPE_CHECKING:
     from schemas.site import Site
-    from services.catalogue.contents import Gap, RecordingSummary, TruckSummary
+    from services.catalogue.contents import Gap, RecordingSummary, SampleGaps, TruckSummary
     from services.finding.bridges import DetectedCrossing
 
 _NS_PER_S: Final = 1_000_000_000  # schemas.signals has it too, and takes numpy to import
@@ -91,6 +91,7 @@ def as_json(one: "RecordingSummary") -> dict[str, Any]:
                 "end": truck.last_ns / _NS_PER_S,
                 "streams": {name: s._asdict() for name, s in truck.streams.items()},
                 "channel_rates_hz": truck.channel_rates_hz,
+                "sample_gaps": truck.sample_gaps._asdict(),
             }
             for truck in one.trucks
         ],
@@ -163,9 +164,12 @@ def lines_of(one: "RecordingSummary") -> Iterator[str]:
     )
     for name, number in sorted(others.items()):
         yield f"{name}: {_count(number, 'message')}"
-    yield from _some("gap", one.gaps, map(_line_of_gap, one.gaps))
+    silences = ("silence of more than a second", "silences of more than a second")
+    yield from _some(silences, one.gaps, map(_line_of_gap, one.gaps))
     if one.site is not None:
-        yield from _some("crossing", one.passings, map(_line_of_passing, one.passings))
+        yield from _some(
+            ("crossing", "crossings"), one.passings, map(_line_of_passing, one.passings)
+        )
 
 
 def _lines_of_truck(truck: "TruckSummary") -> Iterator[str]:
@@ -182,11 +186,24 @@ def _lines_of_truck(truck: "TruckSummary") -> Iterator[str]:
                 yield f"    {', '.join(rates)}: {next(iter(rates.values())):g} Hz"
             else:
                 yield "    " + ", ".join(f"{c} {rate:g} Hz" for c, rate in rates.items())
+            yield f"    {_gaps_in_words(truck.sample_gaps)}"
 
 
-def _some(what: str, all_of_them: "tuple[object, ...]", lines: Iterable[str]) -> Iterator[str]:
+def _gaps_in_words(gaps: "SampleGaps") -> str:
+    if not gaps.number:
+        return "no gaps in the samples"
+    return (
+        f"{_count(gaps.number, 'gap')} in the samples, {gaps.total_s:.3g} s together, the longest "
+        f"{gaps.longest_s:.3g} s; one on a bridge rejects the crossing (gap_on_bridge)"
+    )
+
+
+def _some(
+    what: tuple[str, str], all_of_them: "tuple[object, ...]", lines: Iterable[str]
+) -> Iterator[str]:
+    """Yield the number of things, named in singular and plural, and their first lines."""
     number = len(all_of_them)
-    yield _count(number, what) if number else f"no {what}s"
+    yield f"{number or 'no'} {what[number != 1]}"
     for _, line in zip(range(_MAX_LINES), lines, strict=False):
         yield f"  {line}"
     if number > _MAX_LINES:
@@ -222,7 +239,7 @@ def _print_table(found: "list[RecordingSummary]", unreadable: dict[Path, str]) -
                 _length((one.last_ns - one.first_ns) / _NS_PER_S),
                 ", ".join(sorted({truck.vehicle for truck in one.trucks})) or "—",
                 "not known" if one.site is None else str(len(one.passings)),
-                str(len(one.gaps)),
+                str(_number_of_gaps(one)),
                 _size(one.size_bytes),
                 _state(one),
                 str(one.path),
@@ -243,6 +260,12 @@ def _print_table(found: "list[RecordingSummary]", unreadable: dict[Path, str]) -
         _count(crossings, "crossing"),
     ]
     print(", ".join(counts))
+
+
+def _number_of_gaps(one: "RecordingSummary") -> int:
+    """Return the number of gaps in samples, and of silences of other streams."""
+    silences = sum(gap.stream != "accel" for gap in one.gaps)
+    return silences + sum(truck.sample_gaps.number for truck in one.trucks)
 
 
 def _count(number: int, what: str) -> str:

@@ -1,5 +1,6 @@
 """What a recording holds, against recordings of which that is known."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -26,8 +27,10 @@ def test_trucks_times_rates_and_gaps(tmp_path: Path) -> None:
     assert first.streams["gnss"] == (100, 0, pytest.approx(10.0))
     assert first.channel_rates_hz == {"sprung_front": 1000.0}
     assert (first.first_ns, first.last_ns) == (START_NS, START_NS + 9_950_000_000)
-    # A quarter of a second is no gap, though the messages are missing.
+    # A quarter of a second is no silence, but a gap in the samples.
     assert second.streams["accel"].missing == 5
+    assert first.sample_gaps == (1, pytest.approx(1.5), pytest.approx(1.5))
+    assert second.sample_gaps == (1, pytest.approx(0.25), pytest.approx(0.25))
     begin_ns = START_NS + 99 * 50_000_000
     assert found.gaps == (Gap("truck-1", "accel", begin_ns, begin_ns + 31 * 50_000_000),)
     assert (found.site, found.site_error, found.passings) == (None, None, ())
@@ -39,8 +42,22 @@ def test_between_two_boots_a_truck_was_off(tmp_path: Path) -> None:
     write_recording(path, both, site_toml=None, reason="test")
     found = summarise_recording(path)
     assert found.gaps == ()
+    assert found.trucks[0].sample_gaps == (0, 0.0, 0.0)
     assert found.trucks[0].boots == 2
     assert found.trucks[0].streams["accel"] == (400, 0, pytest.approx(20.0))
+
+
+def test_gap_between_batches_in_sequence_is_counted(tmp_path: Path, csv_example: Path) -> None:
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    lines = (csv_example / "accel_00.csv").read_text().splitlines(keepends=True)
+    (folder / "accel_00.csv").write_text("".join(lines[:200] + lines[230:]))
+    shutil.copy(csv_example / "gps_00.csv", folder)
+    path = tmp_path / "r.mcap"
+    import_command(ImportOptions(sources=(folder,), site=csv_example / "site.toml"), path)
+    (truck,) = summarise_recording(path).trucks
+    assert truck.streams["accel"].missing == 0
+    assert truck.sample_gaps == (1, pytest.approx(0.3), pytest.approx(0.3))
 
 
 def test_crossings_are_those_that_are_identified(

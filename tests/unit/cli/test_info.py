@@ -33,7 +33,8 @@ def test_sample_is_printed_in_full(capsys: pytest.CaptureFixture[str], project: 
     assert "site: truck-1 over bridge-1 (30 m, 7 elements)" in out
     assert "accel: 179 messages, 20 a second" in out
     assert "sprung_front, sprung_rear, unsprung_front, unsprung_rear: 1000 Hz" in out
-    assert "no gaps" in out
+    assert "no gaps in the samples" in out
+    assert "no silences of more than a second" in out
     assert "1 crossing\n  2026-01-01 00:00:02.6  truck-1 over bridge-1, start to end" in out
 
 

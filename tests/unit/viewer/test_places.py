@@ -91,6 +91,7 @@ def test_the_page_names_gaps_and_what_is_not_known(tmp_path: Path) -> None:
     page = recording_page(summarise_recording(recording))
     assert "60 messages missing" in page
     assert "accel: nothing for 3." in page
+    assert "gaps in the samples: 1, the longest 3 s" in page
     assert "No site file in it" in page
 
 
