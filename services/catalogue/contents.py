@@ -161,10 +161,11 @@ class _Extents:
         """Return the lengths of the gaps between samples, s."""
         if not self._sequences:
             return []
-        columns = (np.array(one) for one in (self._sequences, self._times_ns, self._sizes))
-        table = np.column_stack(list(columns))
-        table = table[np.argsort(table[:, 0], kind="stable")]
-        missing = missing_samples(*table.T, self._rate_hz)
+        sequences, times_ns, sizes = (
+            np.array(one) for one in (self._sequences, self._times_ns, self._sizes)
+        )
+        order = np.argsort(sequences, kind="stable")
+        missing = missing_samples(sequences[order], times_ns[order], sizes[order], self._rate_hz)
         return [float(number) / self._rate_hz for number in missing[missing > 0]]
 
 

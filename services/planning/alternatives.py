@@ -38,6 +38,11 @@ class Plan(NamedTuple):
         return "half in the other direction" if self.name == _OTHER_WAY else self.name
 
     @property
+    def fewest_crossings(self) -> int:
+        """Fewest crossings that the plan can have: half of one crossing is none."""
+        return 2 if self.name.startswith("half of the runs") else 1
+
+    @property
     def site(self) -> Site:
         """Site with the elements and tyres of the plan."""
         return self.tracks[0][0].site

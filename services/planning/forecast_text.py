@@ -5,6 +5,7 @@ from itertools import accumulate
 from typing import Any
 
 from pre_core.survey.detection import DETECTION_PROBABILITY, FALSE_ALARM
+from services.identification.comparison import CLEAR_LOSS
 from services.planning.advice import advice, mismatch_in_words, percent, tyres_of, warnings
 from services.planning.crossings import scale_error
 from services.planning.survey import (
@@ -87,6 +88,10 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     yield "±: standard deviation of EI; near 55 % it is the prior's; seen: probability that"
     yield "the loss is detected against the nominal value; vs others: against the others;"
     yield f"smallest: loss that is detected with {percent(DETECTION_PROBABILITY)} probability"
+    yield f"detected: by a one-sided test with {false} false alarms; a report calls an element"
+    clear = percent(CLEAR_LOSS)
+    yield f"clearly less stiff only if its whole 95 % interval is more than {clear} below"
+    yield "the others or the baseline, which takes a larger loss or more crossings"
     yield ""
     yield from _aligned(_comparison(found))
     wanted = percent(DETECTION_PROBABILITY)

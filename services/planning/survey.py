@@ -184,8 +184,8 @@ def _forecast_of(
         _expected(simulated, plan, tracks, 1, question.loss),
         expected,
         _less_determined(plan.site.bridges[0], expected),
-        _needed(errors_of, question.loss, middles),
-        _needed(errors_of, question.loss, (0, last)),
+        _needed(errors_of, question.loss, middles, plan.fewest_crossings),
+        _needed(errors_of, question.loss, (0, last), plan.fewest_crossings),
     )
 
 
@@ -275,9 +275,15 @@ def _at_speed(
 
 
 def _needed(
-    errors_of: Callable[[int], detection.DetectionErrors], loss: float, elements: tuple[int, ...]
+    errors_of: Callable[[int], detection.DetectionErrors],
+    loss: float,
+    elements: tuple[int, ...],
+    fewest: int = 1,
 ) -> int | None:
-    """Return the fewest crossings that detect the loss with certainty in these elements."""
+    """Return the fewest crossings that detect the loss with certainty in these elements.
+
+    A plan has at least `fewest` crossings.
+    """
 
     def is_seen(crossings: int) -> bool:
         seen = detection.detection_probability(loss, errors_of(crossings).of_nominal)
@@ -285,7 +291,7 @@ def _needed(
 
     if not is_seen(MAX_CROSSINGS):
         return None
-    too_few, enough = 0, MAX_CROSSINGS
+    too_few, enough = fewest - 1, MAX_CROSSINGS
     while enough - too_few > 1:
         tried = (too_few + enough) // 2 if enough < 64 else round(np.sqrt(max(1, too_few) * enough))
         tried = min(max(tried, too_few + 1), enough - 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,11 +15,8 @@ from services.common.errors import InputError
 from services.common.extras import check_extras
 from services.common.language import ENGLISH, Language
 from services.execution.blas import one_blas_thread
-from services.history.bridge_history import BridgeHistory, bridge_history, change_over_time
-from services.history.history_store import bridges_of
-from services.history.periods import Unit
+from services.history.bridge_history import BridgeHistory
 from services.identification.comparison import Comparison, Estimate, compare, per_cent_up
-from services.report.alarm_words import alarm_sentence
 from services.report.cautions import Measured, cautions
 from services.report.earlier import Before, SurveyFile, before_of, combined_surveys
 from services.viewer.bridge_view import BridgeView, describe_bridge, view_of_bridge
@@ -93,50 +90,6 @@ def bridge_reports(
         if any(crossing.bridge == bridge.id for crossing in results.crossings)
     )
     return [_report(name, files, baseline, beside, language) for name in names]
-
-
-def with_histories(
-    reports: Iterable[BridgeReport],
-    history: Path,
-    unit: Unit,
-    warn: Callable[[str], None],
-    language: Language = ENGLISH,
-) -> list[BridgeReport]:
-    """Return the reports with the histories of their bridges, in the realm of the results.
-
-    A finding names active alarms, and a caution the change over time. `warn` is called with bridges
-    that are not in the history. InputError: there is no such folder.
-    """
-    known = bridges_of(history)
-    found = []
-    for report in reports:
-        bridge, realm = report.bridge.id, report.crossings[-1].realm
-        if (realm, bridge) in known:
-            with one_blas_thread():
-                past = bridge_history(history, realm, bridge, unit, warn)
-            report = with_history(report, past, language)
-        else:
-            warn(f"{history}: has no bridge {bridge} in realm {realm}; the report is without it")
-        found.append(report)
-    return found
-
-
-def with_history(report: BridgeReport, past: BridgeHistory, language: Language) -> BridgeReport:
-    """Return a report with a history, whose alarms and changes its finding must not contradict."""
-    report = report._replace(past=past)
-    finding, cautions = report.finding, list(report.cautions)
-    standing = [alarm for alarm in past.alarms if alarm.acknowledged is None]
-    change = change_over_time(past, language)
-    if standing:
-        alarms = "; ".join(alarm_sentence(alarm, language) for alarm in standing)
-        headline = f"{finding.headline} {language.text('finding.alarm', alarms=alarms)}"
-        kind = "open" if finding.kind == "sound" else finding.kind
-        finding = finding._replace(kind=kind, headline=headline)
-        cautions.insert(0, language.text("caution.alarm"))
-    elif change is not None and report.view.comparison is not None:
-        key = f"caution.{report.view.comparison.reference}"
-        cautions.insert(0, language.text(key, over_time=change))
-    return report._replace(finding=finding, cautions=tuple(cautions))
 
 
 def _check(path: Path, results: Results, site: Site) -> None:

@@ -58,7 +58,8 @@ def _report(asked: ReportOptions) -> int:
     from services.common.language import language_of
     from services.common.progress import steps_bar
     from services.ledger.site_of_results import site_of_results
-    from services.report.bridge import bridge_reports, with_histories
+    from services.report.bridge import bridge_reports
+    from services.report.histories import with_histories
     from services.report.page import page
     from services.report.pdf import find_browser, write_pdf
 

@@ -15,7 +15,7 @@ from services.cli import main as cli
 from services.planning import plan_survey
 from services.planning import survey as planning
 from services.planning.advice import advice, warnings
-from services.planning.alternatives import as_planned, with_noise
+from services.planning.alternatives import alternatives, as_planned, with_noise
 from services.planning.crossings import PlannedRoad
 from services.planning.figure import draw_survey
 from services.planning.forecast_text import lines_of
@@ -209,6 +209,22 @@ def test_needed_is_the_fewest() -> None:
     assert probability(0.2, errors_of(needed).of_nominal)[1] >= 0.95
     assert probability(0.2, errors_of(needed - 1).of_nominal)[1] < 0.95
     assert planning._needed(errors_of, 0.01, (1,)) is None
+    assert planning._needed(errors_of, 0.9, (1,)) == 1
+    assert planning._needed(errors_of, 0.9, (1,), fewest=2) == 2
+
+
+def test_half_of_the_runs_takes_at_least_two_crossings() -> None:
+    plans = list(alternatives(paper_site(), 10.0))
+    halves = [plan for plan in plans if plan.label.startswith("half")]
+    assert len(halves) == 3
+    assert {plan.fewest_crossings for plan in halves} == {2}
+    assert {plan.fewest_crossings for plan in plans if plan not in halves} == {1}
+
+
+def test_detection_is_not_the_rule_of_a_clear_finding() -> None:
+    text = " ".join(lines_of(made_up(9, {})))
+    assert "detected: by a one-sided test with 1 % false alarms; a report calls" in text
+    assert "its whole 95 % interval is more than 10 % below the others or the baseline" in text
 
 
 def test_picture_names_bridge_truck_and_threshold() -> None:

@@ -17,8 +17,9 @@ from services.common.language import LANGUAGES, language_of
 from services.history.bridge_history import BridgeHistory, ElementChange, PeriodComparison
 from services.history.watch_files import MonitoringState
 from services.report.advice import next_steps
-from services.report.bridge import BridgeReport, bridge_reports, with_history
+from services.report.bridge import BridgeReport, bridge_reports
 from services.report.earlier import season_of
+from services.report.histories import with_history
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.drawing import STYLE
 from tests.unit.history.test_bridge_history import alarm
