@@ -422,9 +422,10 @@ def until_whole(subscription: Subscription, published: list[RawSample]) -> list[
     return published + after(subscription, 1.5)
 
 
-def kill(process: subprocess.Popen[str]) -> None:
+def kill(process: subprocess.Popen[str]) -> str:
+    """Kill it; return its log."""
     process.kill()
-    process.communicate()
+    return process.communicate()[1]
 
 
 def check_once(published: list[RawSample], restartable: Restartable, recorded: Path) -> None:
@@ -517,7 +518,7 @@ def test_killed_right_after_the_estimate(
         publish(publisher, drive_on)
         process = restartable.begin()
         published = up_to(results, "estimate")
-        kill(process)
+        log = kill(process)
         (path,) = restartable.paths()
         cut_off = path.read_bytes()
         (folder / "results-19990101T000002Z.mcap").write_bytes(cut_off[: len(cut_off) // 2])
@@ -532,7 +533,7 @@ def test_killed_right_after_the_estimate(
             for p in get_latest(bus, selector(REALM, "bridge", "state"))
         ]
         publisher.close()
-        log = stop(process)
+        stop(process)
     check_once(published, restartable, tmp_path / "recorded.mcap")
     (state,) = latest
     estimate = next(
@@ -540,7 +541,9 @@ def test_killed_right_after_the_estimate(
     )
     assert list(state.crossings_used) == [estimate.crossing_id]
     for number in range(2):
-        assert f"results-19990101T00000{number}Z.mcap" in log
+        name = f"results-19990101T00000{number}Z.mcap"
+        assert name in log
+        assert (folder / f"{name}.crashed").exists()
 
 
 def test_what_is_on_the_disk_and_not_on_the_bus(
