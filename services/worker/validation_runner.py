@@ -60,7 +60,13 @@ class ValidationRunner:
         """Whether `note` changed since the flag was last reset by its reader."""
 
     def request(self, pair: VehicleBridgePair) -> None:
-        """Request the validation of a pair, whose crossings wait."""
+        """Request the validation of a pair, whose crossings wait.
+
+        Live crossings and those of recordings request it independently; it is validated once.
+        """
+        is_running = self._trial is not None and self._trial.pair == pair
+        if is_running or pair in self._wanted or pair in self._failed:
+            return
         self._wanted.append(pair)
         self._next_check_s = 0.0
 

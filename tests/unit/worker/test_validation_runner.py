@@ -107,6 +107,26 @@ def test_nothing_is_done_that_nobody_wants(tmp_path: Path) -> None:
     assert not (tmp_path / "certificates").exists()
 
 
+@pytest.mark.parametrize("verdict", ["good", "rejected"])
+def test_pair_requested_twice_is_validated_once(tmp_path: Path, verdict: str) -> None:
+    """By a live crossing and by one of a recording, before, during and after its validation."""
+    once, places = Places(verdict), Places(verdict)
+    single = certificates(tmp_path / "once", once)
+    single.request(PAIR)
+    until_over(single, once)
+    one = certificates(tmp_path / "twice", places)
+    one.request(PAIR)
+    one.request(PAIR)
+    assert one.advance(0.0) == {}
+    one.request(PAIR)
+    passed = until_over(one, places, now_s=1.0)
+    assert list(passed) == ([PAIR] if verdict == "good" else [])
+    assert places.begun == once.begun
+    one.request(PAIR)
+    until_over(one, places, now_s=2.0)
+    assert places.begun == once.begun
+
+
 def test_pairs_are_validated_in_the_order_in_which_they_are_wanted(tmp_path: Path) -> None:
     places, folder = Places(), tmp_path / "certificates"
     one = certificates(folder, places)
