@@ -1,8 +1,12 @@
 """Optional packages: which extra brings each, and the error of a command that lacks one."""
 
+import json
 from collections.abc import Iterable, Mapping
+from importlib.metadata import PackageNotFoundError, distribution
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Final
+from urllib.parse import unquote, urlsplit
 
 from services.common.errors import InputError
 
@@ -48,8 +52,31 @@ def _is_found(module: str) -> bool:
         return False
 
 
+def install_command(extra: str) -> str:
+    """Return the command that installs extras, from the wheel or checkout of this installation.
+
+    There is no release on PyPI yet; where the origin is unknown or gone, WHEEL stands for it.
+    """
+    origin = _origin()
+    if origin is None:
+        return f'pip install "WHEEL[{extra}]" with your wheel of driveby'
+    editable = "-e " if origin.is_dir() else ""
+    return f'pip install {editable}"{origin}[{extra}]"'
+
+
+def _origin() -> Path | None:
+    """Return the wheel or checkout that pip has recorded for this installation (PEP 610)."""
+    try:
+        recorded = distribution("driveby").read_text("direct_url.json")
+        url = urlsplit(json.loads(recorded or "{}").get("url", ""))
+    except (PackageNotFoundError, ValueError):
+        return None
+    path = Path(unquote(url.path))
+    return path if url.scheme == "file" and path.exists() else None
+
+
 def _sentence(what: str, missing: list[str], extra: str) -> str:
     verb = "is" if len(missing) == 1 else "are"
     *first, last = missing
     named = f"{', '.join(first)} and {last}" if first else last
-    return f'{what} needs {named}, which {verb} not installed: pip install "driveby[{extra}]"'
+    return f"{what} needs {named}, which {verb} not installed: {install_command(extra)}"

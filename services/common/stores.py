@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple
 
 from services.common.errors import FailureError, InputError
-from services.common.extras import check_installed
+from services.common.extras import check_installed, install_command
 from services.common.files import make_folder, write_atomically
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def folder_at(name: str) -> Folder:
         files, root = url_to_fs(name)
     except ImportError:
         package, extra = _EXTRAS.get(protocol, (f"a package of fsspec for {protocol}", ""))
-        how = f': pip install "driveby[{extra}]"' if extra else ""
+        how = f": {install_command(extra)}" if extra else ""
         raise InputError(f"{name}: needs {package}, which is not installed{how}") from None
     except ValueError:
         raise InputError(

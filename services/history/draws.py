@@ -2,7 +2,7 @@
 
 OUT.nc is NetCDF-4 in the convention of ArviZ's InferenceData, for `arviz.from_netcdf("OUT.nc")`: a
 group `posterior` in which every parameter is an array (chain, draw, crossing). It needs the extra
-`driveby[notebook]`. OUT.npz needs nothing but numpy and holds arrays (chain, draw) named NAME, or
+`notebook`. OUT.npz needs nothing but numpy and holds arrays (chain, draw) named NAME, or
 CROSSING/NAME where there are several crossings.
 """
 

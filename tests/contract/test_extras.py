@@ -19,7 +19,7 @@ from schemas.site_file import site_toml
 from services.cli import main as cli
 from services.cli.table import COMMANDS
 from services.common.errors import InputError
-from services.common.extras import EXTRAS, check_extras, check_installed
+from services.common.extras import EXTRAS, check_extras, check_installed, install_command
 from services.simulation.drive import paper_site
 from tests import ros2
 from tests.builders.processes import stop
@@ -251,7 +251,7 @@ def test_an_import_of_ros_2_needs_its_extra_only(tmp_path: Path) -> None:
     site.write_text(site_toml(paper_site()) + ros2.ROS2)
     source = ros2.record(tmp_path / "bag", drive(1.0), StoragePlugin.MCAP)
     words = ("import", str(source), "--site", str(site), "-o", out)
-    assert 'pip install "driveby[ros2]"' in run("", *words, code=2)
+    assert install_command("ros2") in run("", *words, code=2)
     run("ros2", *words)
     assert Path(out).is_file()
 
@@ -276,7 +276,7 @@ def test_notebook_names_the_missing_package(name: str, extra: str) -> None:
         "except driveby.InputError as error:\n    print(error)"
     )
     extras = "identify" if extra == "view" else ""
-    assert f'pip install "driveby[{extra}]"' in run(extras, "python", code)
+    assert install_command(extra) in run(extras, "python", code)
 
 
 @contextmanager
@@ -309,6 +309,6 @@ def test_truck_logger_worker_and_replay_run_with_what_they_need(tmp_path: Path) 
         run("", "replay", str(SAMPLE), *at, "--speed", "0", "--name", "extras")
         assert "logger" in run("", "health", "logger", *at)
         log = stop(process)
-    assert log.count('pip install "driveby[history]"; recording without it') == 1
+    assert log.count(f"{install_command('history')}; recording without it") == 1
     recorded = {path.relative_to(folder).parts[0] for path in folder.rglob("*.mcap")}
     assert {"sim-extras", "replay-extras"} <= recorded

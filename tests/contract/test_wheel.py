@@ -218,7 +218,7 @@ def test_a_trucks_computer_holds_what_it_needs_and_no_more(
         driveby("export", sample, "--to", "csv")
         lacking = ended(environment, "driveby", "identify", str(sample), cwd=tmp_path)
         assert (lacking.returncode, lacking.stderr.count("\n")) == (2, 1)
-        assert 'pip install "driveby[identify]"' in lacking.stderr
+        assert f'pip install "{wheel}[identify]"' in lacking.stderr
 
     (packages,) = environment.glob("lib/*/site-packages")
     as_installed_mb = size_mb(packages)

@@ -28,6 +28,7 @@ from schemas.signals import CHANNELS
 from schemas.topics import Message
 from services.cli import main as cli
 from services.common import extras
+from services.common.extras import install_command
 from services.common.field_docs import with_field_docs
 from services.notebook import identify as identifying
 from services.notebook import simulate as simulating
@@ -651,7 +652,7 @@ def test_what_is_not_installed_is_named(
     without(monkeypatch, module)
     with pytest.raises(driveby.InputError) as caught:
         call(exact, simulation.signals)
-    line = f'needs {module}, which is not installed: pip install "driveby[notebook]"'
+    line = f"needs {module}, which is not installed: {install_command('notebook')}"
     assert line in str(caught.value)
 
 

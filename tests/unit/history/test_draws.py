@@ -149,7 +149,7 @@ def test_netcdf_without_its_extra_is_refused_before_any_work(
     err = capsys.readouterr().err
     assert err == (
         "driveby: draws.nc: NetCDF needs xarray, which is not installed: "
-        'pip install "driveby[notebook]" (or name a file .npz)\n'
+        f"{extras.install_command('notebook')} (or name a file .npz)\n"
     )
     assert list(tmp_path.iterdir()) == []
 
