@@ -53,7 +53,7 @@ def test_subscriber_receives_results_over_tls(
 ) -> None:
     """With the arguments of the page, but for the address."""
     text = (project / "docs" / "programmer.md").read_text()
-    (shown,) = re.findall(r"subscriber.py tls/\S+ '(\S+)' certs/(\S+)", text)
+    (shown,) = re.findall(r"subscriber.py tls/\S+ '(\S+)' certs/([a-z]+)", text)
     stack.enter_context(open_session(listen=tls_endpoint, tls=credentials / "logger"))
     worker = stack.enter_context(
         open_session(connect=tls_endpoint, timeout_s=LONGEST_S, tls=credentials / "worker")
