@@ -13,7 +13,6 @@ from services.common.options import (
     flag,
     opt,
     positional,
-    realm_option,
     tls_option,
 )
 
@@ -44,7 +43,10 @@ class HealthOptions:
     )
     endpoint: str | None = endpoint_option()
     tls: Path | None = tls_option()
-    realm: str = realm_option()
+    realm: str = opt(
+        "realm of the service; live for a logger of several realms or a pattern (default: live)",
+        default="live",
+    )
 
 
 def _health(options: HealthOptions, announce: Announce) -> int:

@@ -1,6 +1,7 @@
 """`driveby health` of a service that does not answer."""
 
 import time
+from pathlib import Path
 
 import pytest
 
@@ -15,8 +16,20 @@ def test_silent_service_is_named_with_its_realm(endpoint: str) -> None:
     with open_session(listen=endpoint), pytest.raises(FailureError) as caught:
         health_command(service="logger", endpoint=endpoint, tls=None, realm="sim-a", patience_s=0.5)
     assert str(caught.value) == (
-        f"logger in realm sim-a sends nothing at {endpoint}; --realm NAME asks another"
+        f"logger in realm sim-a sends nothing at {endpoint}; --realm NAME asks another (a logger "
+        "of several realms or a pattern: live)"
     )
+
+
+def test_silence_with_credentials_names_the_list(credentials: Path, tls_endpoint: str) -> None:
+    tls = credentials / "viewer"
+    with (
+        open_session(listen=tls_endpoint, tls=credentials / "logger"),
+        pytest.raises(FailureError, match="or the router's list of participants lacks viewer/vie"),
+    ):
+        health_command(
+            service="logger", endpoint=tls_endpoint, tls=tls, realm="live", patience_s=0.5
+        )
 
 
 def test_clock_of_a_service_that_is_ahead_is_reported(endpoint: str) -> None:
