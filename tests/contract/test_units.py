@@ -15,6 +15,9 @@ from services.cli.table import name_of
 
 ROOT = Path(__file__).parents[2]
 UNITS = {path.stem.removeprefix("driveby-"): path for path in (ROOT / "deploy").glob("*.service")}
+SERVICES = ("logger", "worker")
+JOBS = ("health", "night")
+"""Units that a timer starts."""
 PROGRAM = "/opt/driveby/bin/driveby"
 SANDBOX = {
     "CapabilityBoundingSet": "",
@@ -52,11 +55,50 @@ def unit(name: str) -> ConfigParser:
     return parser
 
 
-def test_logger_and_worker_have_units() -> None:
-    assert set(UNITS) == {"logger", "worker"}
+def test_services_and_jobs_have_units() -> None:
+    assert set(UNITS) == {*SERVICES, *JOBS}
 
 
-@pytest.mark.parametrize("name", UNITS)
+@pytest.mark.parametrize("name", JOBS)
+def test_timer_starts_its_job(name: str) -> None:
+    timer = UNITS[name].with_suffix(".timer").read_text()
+    assert re.search(r"^OnCalendar=\S", timer, re.MULTILINE)
+    assert "WantedBy=timers.target" in timer
+    assert unit(name)["Service"]["Type"] == "oneshot"
+    assert f"enable --now driveby-{name}.timer" in UNITS[name].read_text()
+
+
+def test_health_unit_queries_logger_and_worker() -> None:
+    text = UNITS["health"].read_text()
+    starts = re.findall(rf"^ExecStart={PROGRAM} (.*) \$BUS$", text, re.MULTILINE)
+    (shown,) = re.findall(r'Environment="BUS=(-.*)"', text)
+    for start, name in zip(starts, SERVICES, strict=True):
+        options = cli._parser().parse_args([*start.split(), *shown.split()])
+        assert (name_of(options), options.service) == ("health", name)
+        assert options.tls == Path("/etc/driveby/tls/viewer")
+
+
+def test_night_unit_runs_the_script_with_its_arguments() -> None:
+    service = unit("night")["Service"]
+    shell, script, *arguments = shlex.split(service["ExecStart"])
+    name = Path(script).name
+    example = (ROOT / "docs" / "examples" / "fleet_night" / name).read_text()
+    assert shell == "/bin/sh"
+    assert f"{name} RECORDINGS SITE.toml TEMPERATURES.csv" in example
+    assert arguments[:2] == ["recordings", "/etc/driveby/site.toml"]
+    assert len(arguments) == 3
+    assert f"PATH={Path(PROGRAM).parent}:" in UNITS["night"].read_text()
+
+
+def test_installation_places_credentials_where_the_options_expect_them() -> None:
+    installed = UNITS["logger"].read_text()
+    (copied,) = re.findall(r"cp -r (.*) /etc/driveby/tls$", installed, re.MULTILINE)
+    places = {f"/etc/driveby/tls/{Path(one).name}" for one in copied.split()}
+    named = "".join(path.read_text() for path in sorted((ROOT / "deploy").iterdir()))
+    assert set(re.findall(r"/etc/driveby/tls/\w+", named)) == places
+
+
+@pytest.mark.parametrize("name", SERVICES)
 def test_unit_starts_its_command(name: str, tmp_path: Path) -> None:
     service = unit(name)["Service"]
     program, *arguments = shlex.split(service["ExecStart"])
@@ -84,8 +126,8 @@ def test_unit_is_confined(name: str) -> None:
     assert {key: service.get(key) for key in SANDBOX} == SANDBOX
     filters = re.findall(r"^SystemCallFilter=(.*)$", UNITS[name].read_text(), re.MULTILINE)
     assert filters == ["@system-service", "~@privileged"]
-    # numba compiles in the worker's memory; a logger compiles nothing.
-    assert service["MemoryDenyWriteExecute"] == ("no" if name == "worker" else "yes")
+    # numba compiles in memory where crossings are identified, and only there.
+    assert service["MemoryDenyWriteExecute"] == ("no" if name in ("worker", "night") else "yes")
     assert service["User"] != "root"
 
 
@@ -104,11 +146,14 @@ def test_systemd_accepts_the_units(tmp_path: Path) -> None:
         copy = tmp_path / path.name
         copy.write_text(path.read_text().replace(PROGRAM, sys.executable))
         paths.append(str(copy))
+    for name in JOBS:
+        shutil.copy(UNITS[name].with_suffix(".timer"), tmp_path)
+        paths.append(str(tmp_path / f"driveby-{name}.timer"))
     done = subprocess.run(
         ["systemd-analyze", "verify", *paths], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
-    for verified in paths:
+    for verified in [path for path in paths if path.endswith(".service")]:
         security = ["systemd-analyze", "security", "--offline=true", f"--threshold={EXPOSURE}"]
         done = subprocess.run([*security, verified], capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout
