@@ -283,6 +283,7 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     assert "-4-weaker of bridge-2, raised 2025-" in said
     how = "then acknowledge the alarm: driveby alarm ack BRIDGE --by NAME --note TEXT\n"
     assert said.endswith(how)
+    assert "\nan alarm compares periods; identify and fuse combine all crossings" in said
     assert "\n2 of 2 bridges monitored\n" in said
     assert cli.main(["alarm", "list", *there]) == 0
     assert capsys.readouterr().out.endswith(how)
