@@ -2,10 +2,10 @@
 
 python ros2_sdk_truck.py HOST PORT MESSAGES.json
 
-The file is a list of [topic, type, stamp in ns, numbers]. The drive is shifted to the present and
-takes as long as it took: the attachments have the time of sending. Keys, hashes of types,
-attachments and CDR are the SDK's; definitions of messages are those of common_interfaces without
-comments.
+The file is a list of [topic, type, stamp in ns, numbers as text]. The drive is shifted to the
+present and takes as long as it took: the attachments have the time of sending. Keys, hashes of
+types, attachments and CDR are the SDK's; definitions of messages are those of common_interfaces
+without comments.
 """
 
 import json
@@ -117,11 +117,12 @@ def main(host: str, port: str, path: str) -> None:
             time.sleep(0.01)
     types = ZenohSession.get_instance(host, int(port)).store.types
     shift_ns = time.time_ns() - messages[0][2]
-    for topic, of, stamp_ns, numbers in messages:
+    for topic, of, stamp_ns, words in messages:
         # The SDK's publishers drop where the network holds them up, so it is not flooded.
         early_s = (stamp_ns + shift_ns - time.time_ns()) * 1e-9
         if early_s > 0.005:
             time.sleep(early_s)
+        numbers = [float(word) for word in words]
         publishers[topic].publish(**fields(of, stamp_ns + shift_ns, numbers, types))
     keys = [one.keyexpr for one in publishers.values()]
     print(json.dumps({"shift_ns": shift_ns, "keys": keys}), flush=True)

@@ -61,10 +61,18 @@ def running(
     program: str, folder: Path, listen: str, connect: str, log: Path, *further: str
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Run `zenohd` until the block ends; it listens when the block begins."""
+    words = [*command(program, folder, listen, connect), *further]
+    with listening(words, listen, log) as process:
+        yield process
+
+
+@contextmanager
+def listening(words: list[str], listen: str, log: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a router's command until the block ends; it listens when the block begins."""
     host, port = listen.partition("/")[2].split(":")
     with log.open("wb") as output:
         process = subprocess.Popen(
-            [*command(program, folder, listen, connect), *further],
+            words,
             stdout=output,
             stderr=subprocess.STDOUT,
             env={**os.environ, "RUST_LOG": "info"},

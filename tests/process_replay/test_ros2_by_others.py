@@ -1,16 +1,21 @@
-"""A truck of ROS 2 whose client others wrote: zenoh-ros2-sdk, in an interpreter of its own.
+"""Trucks of ROS 2 whose clients others wrote, in programs of their own.
 
     python -m venv sdk && sdk/bin/pip install zenoh-ros2-sdk
     ROS2_SDK_PYTHON=sdk/bin/python pytest tests/process_replay/test_ros2_by_others.py -m slow
 
-The SDK's session is a client of the router, its hashes of types, keys and attachments are its own.
+`zenoh-ros2-sdk` is in Python, its session a client of the router. `hiroz` is in Rust, its session
+a peer; cargo compiles it for some minutes. Hashes of types, keys, attachments and CDR are their
+own. The router is that of the Python package and, where `zenohd` is found (zenohd.py), this one.
 """
 
 import json
 import math
 import os
+import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,32 +32,75 @@ from services.drives.signals import Signals
 from services.recordings.recording import read_messages
 from tests import ros2
 from tests.builders.processes import stop
+from tests.containers import zenohd
+from tests.endpoints import free_endpoint
 from tests.process_replay.starting import End, Process, Start, start_logger
 from tests.process_replay.test_ros2_gateway import (
-    Ros,
+    ROUTER,
     assert_same,
     estimate,
     gateway,
     heard,
     one_run,
-    ros,
+    opened,
     ros_site,
     simulate_to,
 )
 from tests.waiting import LONGEST_S
 
-__all__ = ["gateway", "ros", "ros_site"]
-pytestmark = [pytest.mark.process, pytest.mark.slow]
+__all__ = ["gateway", "ros_site"]
+pytestmark = [pytest.mark.process, pytest.mark.slow, pytest.mark.timeout(1800)]
 SCRIPT = Path(__file__).parents[1] / "ros2_sdk_truck.py"
+CRATE = Path(__file__).parents[1] / "hiroz_truck"
+COMPILED = CRATE.parents[1] / "build" / "hiroz"
 
 
-@pytest.fixture(scope="module")
-def interpreter() -> str:
-    """A Python that has zenoh-ros2-sdk."""
+@pytest.fixture(scope="module", params=["zenoh-ros2-sdk", "hiroz"])
+def client(request: pytest.FixtureRequest) -> list[str]:
+    """Return the command of a truck."""
+    return sdk() if request.param == "zenoh-ros2-sdk" else hiroz()
+
+
+def sdk() -> list[str]:
     found = os.environ.get("ROS2_SDK_PYTHON")
     if not found:
         pytest.skip("ROS2_SDK_PYTHON names no Python with zenoh-ros2-sdk")
-    return found
+    return [found, str(SCRIPT)]
+
+
+def hiroz() -> list[str]:
+    if shutil.which("cargo") is None:
+        pytest.skip("no cargo for hiroz: https://rustup.rs")
+    jobs = {"CARGO_BUILD_JOBS": "2", **os.environ, "CARGO_TARGET_DIR": str(COMPILED)}
+    cargo = partial(subprocess.run, cwd=CRATE, env=jobs, capture_output=True, text=True)
+    fetched = cargo(["cargo", "fetch"])
+    if fetched.returncode != 0:
+        pytest.skip(f"no hiroz by cargo: {fetched.stderr.strip().splitlines()[-1]}")
+    built = cargo(["cargo", "build", "--release", "--offline"])
+    assert built.returncode == 0, built.stderr
+    return [str(COMPILED / "release" / "hiroz_truck")]
+
+
+@pytest.fixture(params=["zenoh", "zenohd"])
+def ros_endpoint(
+    request: pytest.FixtureRequest, client: list[str], tmp_path: Path
+) -> Iterator[str]:
+    """Run a router as rmw_zenoh configures it; return its endpoint."""
+    endpoint = free_endpoint()
+    program = zenohd.find()
+    if request.param == "zenoh":
+        router: AbstractContextManager[Any] = opened(
+            mode="router", listen__endpoints=[endpoint], **ROUTER
+        )
+    elif program is None:
+        pytest.skip("no zenohd for ROS 2: ZENOHD names it")
+    else:
+        settings = {name.replace("__", "/"): json.dumps(value) for name, value in ROUTER.items()}
+        options = [f"--cfg={name}:{value}" for name, value in settings.items()]
+        words = [program, f"--listen={endpoint}", *options]
+        router = zenohd.listening(words, endpoint, tmp_path / "zenohd.log")
+    with router:
+        yield endpoint
 
 
 def of_drive(path: Path) -> list[tuple[str, str, int, list[float]]]:
@@ -90,11 +138,11 @@ def shifted(drive: Signals, shift_ns: int) -> Signals:
 
 
 def test_crossing_of_another_client_gives_the_same_as_directly(
-    interpreter: str,
+    client: list[str],
     start: Start,
     terminate: End,
     gateway: Callable[..., Process],
-    ros: Ros,
+    ros_endpoint: str,
     ros_site: Path,
     endpoint: str,
     tmp_path: Path,
@@ -102,18 +150,19 @@ def test_crossing_of_another_client_gives_the_same_as_directly(
     direct, live = tmp_path / "direct.mcap", tmp_path / "live.mcap"
     simulate_to(direct)
     messages = of_drive(direct)
-    (tmp_path / "messages.json").write_text(json.dumps(messages))
+    written = [(*one, [repr(number) for number in numbers]) for *one, numbers in messages]
+    (tmp_path / "messages.json").write_text(json.dumps(written))
     # A busy machine may publish seconds late.
     late = ros_site.read_text().replace("[ros2]\n", "[ros2]\nlargest_delay_s = 60.0\n", 1)
     ros_site.write_text(late)
     logger = start_logger(start, endpoint, live, site=ros_site)
     process = gateway("--spool", str(tmp_path / "spool"))
-    host, port = ros.endpoint.removeprefix("tcp/").rsplit(":", 1)
+    host, port = ros_endpoint.removeprefix("tcp/").rsplit(":", 1)
     with (
         open_session(connect=endpoint, timeout_s=LONGEST_S) as session,
         Subscription(session, selector("sim-ros", "vehicle", "accel")) as subscription,
         subprocess.Popen(
-            [interpreter, str(SCRIPT), host, port, str(tmp_path / "messages.json")],
+            [*client, host, port, str(tmp_path / "messages.json")],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -38,6 +38,11 @@ from tests.waiting import LONGEST_S, until
 pytestmark = pytest.mark.process
 
 FIRST_NS = 1_700_000_000_000_000_000
+ROUTER = {
+    "scouting__multicast__enabled": False,
+    "routing__router__peers_failover_brokering": False,
+}
+"""Settings of rmw_zenoh's router: it does not forward between peers, which connect themselves."""
 
 
 class Ros(NamedTuple):
@@ -55,25 +60,23 @@ def opened(**settings: object) -> zenoh.Session:
 
 
 @pytest.fixture
-def ros() -> Iterator[Ros]:
-    """As rmw_zenoh's own configuration has it: nodes are peers, between which the router does not
-    broker, as they would connect to each other; a client it serves."""
+def ros_endpoint() -> Iterator[str]:
+    """Run a router as rmw_zenoh configures it; return its endpoint."""
     endpoint = free_endpoint()
-    with (
-        opened(
-            mode="router",
-            listen__endpoints=[endpoint],
-            scouting__multicast__enabled=False,
-            routing__router__peers_failover_brokering=False,
-        ),
-        opened(
-            mode="peer",
-            connect__endpoints=[endpoint],
-            listen__endpoints=["tcp/127.0.0.1:0"],
-            scouting__multicast__enabled=False,
-        ) as session,
-    ):
-        yield Ros(endpoint, session)
+    with opened(mode="router", listen__endpoints=[endpoint], **ROUTER):
+        yield endpoint
+
+
+@pytest.fixture
+def ros(ros_endpoint: str) -> Iterator[Ros]:
+    """Open a peer's session, as rmw_zenoh configures nodes: the router serves clients only."""
+    with opened(
+        mode="peer",
+        connect__endpoints=[ros_endpoint],
+        listen__endpoints=["tcp/127.0.0.1:0"],
+        scouting__multicast__enabled=False,
+    ) as session:
+        yield Ros(ros_endpoint, session)
 
 
 @pytest.fixture
@@ -84,14 +87,14 @@ def ros_site(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def gateway(ros: Ros, endpoint: str, ros_site: Path) -> Iterator[Callable[..., Process]]:
+def gateway(ros_endpoint: str, endpoint: str, ros_site: Path) -> Iterator[Callable[..., Process]]:
     """Start the command; it listens when it is returned."""
     started: list[Process] = []
 
     def start(*options: str) -> Process:
         process = subprocess.Popen(
             [
-                *(sys.executable, "-m", "driveby", "gateway", "ros2", "--ros", ros.endpoint),
+                *(sys.executable, "-m", "driveby", "gateway", "ros2", "--ros", ros_endpoint),
                 *("--endpoint", endpoint, "--site", str(ros_site), "--realm", "sim-ros"),
                 *options,
             ],
