@@ -165,8 +165,9 @@ def declared_site(
 def write_drive(
     path: Path, drive: SimulatedDrive, site: Site, realm: str = "sim-drive", *, force: bool = False
 ) -> int:
-    """Write the recording that the truck would have made, with the site in it."""
-    return write_drives(path, [drive], site, realm, force=force)
+    """Write the recording that the truck would have made, at the drive's own time."""
+    own_time = Schedule(start_s=float(drive.run.accel_time_s[0]))
+    return write_drives(path, [drive], site, realm, force=force, schedule=own_time)
 
 
 def write_drives(

@@ -729,6 +729,18 @@ def test_simulation_started_at_another_time_is_another_crossing(
         assert str(caught.value).startswith("start")
 
 
+def test_recording_of_a_simulation_keeps_its_start(
+    simulation: driveby.Simulation, tmp_path: Path
+) -> None:
+    """Recordings of one time are one crossing, of which all but one would be dropped."""
+    for day in ("2026-05-01", "2026-05-02"):
+        later = simulation.started_at(f"{day}T09:30:00Z")
+        later.write(tmp_path / f"{day}.mcap")
+        (signals,) = driveby.read(tmp_path / f"{day}.mcap")
+        begin = signals.channels["unsprung_front"].time_ns[0]
+        assert str(begin.astype("datetime64[ns]").astype("datetime64[s]")) == f"{day}T09:30:00"
+
+
 def test_plot_draws_a_fused_bridge(found: driveby.Identification, tmp_path: Path) -> None:
     fused = driveby.fuse(found)
     panel, *_ = driveby.plot(fused, bridge="bridge-1").axes
