@@ -173,8 +173,8 @@ def take(shot: Shot, folder: Path, size: str = "1400x850") -> bytes:
         return taken
 
 
-def take_report(folder: Path, size: str = "794,1123") -> bytes:
-    """The first page of the sample's report as a browser shows it, A4 at 96 pixels an inch."""
+def take_report(folder: Path, size: str = "794,1046") -> bytes:
+    """The top of the sample's report as a browser shows it, as wide as A4 at 96 pixels an inch."""
     html = folder / "report.html"
     site = folder / "site.toml"
     site.write_text(read_site(SAMPLE) or "")
@@ -224,11 +224,11 @@ ON_THE_BRIDGE, GOOD = (0, 114, 178), (0, 158, 115)
 
 
 def shows(viewer: ViewerClient, colour: tuple[int, int, int], fewest: int) -> None:
-    """Wait until the lane of the crossing, at the left below, has a colour."""
+    """Wait until the lane of the crossing, at the left below the plots, has a colour."""
 
     def is_seen() -> bool:
         seen = pixels(viewer.take_screenshot())
-        lanes = seen[seen.shape[0] // 2 :, : seen.shape[1] // 3]
+        lanes = seen[3 * seen.shape[0] // 4 :, : 3 * seen.shape[1] // 5]
         wanted = 0.8 * np.array(colour) / 255.0
         return bool((np.abs(lanes - wanted).max(axis=2) < 0.06).sum() > fewest)
 

@@ -76,7 +76,8 @@ def open_tab(client: ViewerClient, *names: str) -> None:
     for name in names:
         hit = False
         for container in containers.values():
-            for child in container["contents"]:
+            inside = container.get("contents", [])  # a name, where there is one
+            for child in [inside] if isinstance(inside, str) else inside:
                 if container["container_kind"] == "Tabs" and called(child).startswith(name):
                     container["active_tab"], hit = child, True
         assert hit, f"no tab {name}"

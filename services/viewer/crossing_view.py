@@ -89,6 +89,11 @@ class RoadView(NamedTuple):
     front_m: FloatArray
     rear_m: FloatArray
 
+    @property
+    def largest_m(self) -> float:
+        """Largest absolute height of both profiles, m."""
+        return float(max(np.abs(self.front_m).max(), np.abs(self.rear_m).max()))
+
 
 class ParameterRow(NamedTuple):
     """One line of the table of parameters."""

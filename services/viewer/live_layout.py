@@ -15,8 +15,10 @@ from services.viewer.rerun_parts import TIME, flat_view
 from services.viewer.rerun_places import BridgeOnMap
 from services.viewer.strip import STRIP_WIDTH
 
-WINDOW_S: Final = 60.0
-"""Time in s of accelerations and crossings before the cursor."""
+_WINDOW_S: Final = 60.0
+"""Time in s of accelerations before the cursor."""
+_LANES_WINDOW_S: Final = 30.0
+"""Time in s of the lanes of crossings: the name of a state of three seconds fits."""
 _FUSED: Final = "fused EI / nominal"
 WAITING = "waiting"
 """Entity of the page shown until the first message."""
@@ -47,13 +49,14 @@ def live_blueprint(
     trucks: Mapping[str, Set[str]], bridges: Sequence[str], on_map: Sequence[BridgeOnMap]
 ) -> rrb.Blueprint:
     """Return the layout of the drawn trucks and bridges, and of the bridges with a position."""
-    columns: list[tuple[rrb.Container | rrb.View, int]] = [(_where_and_when(on_map), 4)]
+    upper = [_places(on_map)]
     if trucks:
-        columns.append((_tabs([_truck(name, known) for name, known in trucks.items()]), 4))
-    if bridges:
-        columns.append((_tabs([_bridge(name) for name in bridges]), 5))
-    shares = [share for _, share in columns]
-    return _blueprint(rrb.Horizontal(*(one for one, _ in columns), column_shares=shares))
+        upper.append(_tabs([_truck(name, known) for name, known in trucks.items()]))
+    left = rrb.Vertical(rrb.Horizontal(*upper), _lanes(), row_shares=[3, 1])
+    if not bridges:
+        return _blueprint(left)
+    results = _tabs([_bridge(name) for name in bridges])
+    return _blueprint(rrb.Horizontal(left, results, column_shares=[4 * len(upper), 5]))
 
 
 def _blueprint(root: rrb.Container | rrb.View) -> rrb.Blueprint:
@@ -66,26 +69,29 @@ def _blueprint(root: rrb.Container | rrb.View) -> rrb.Blueprint:
     )
 
 
-def _where_and_when(on_map: Sequence[BridgeOnMap]) -> rrb.Container:
+def _places(on_map: Sequence[BridgeOnMap]) -> rrb.Container | rrb.View:
     plans = [bridge_places(bridge, legend=_FUSED, name=bridge.identifier) for bridge in on_map]
-    places = _tabs(plans) if plans else bridge_places(None, legend="")
+    return _tabs(plans) if plans else bridge_places(None, legend="")
+
+
+def _lanes() -> rrb.View:
+    """Lay out the lanes below plan and accelerations, wide enough for the names of states."""
     infinite = rrb.TimeRangeBoundary.infinite()
     shown = rrb.TimeRange(
-        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-WINDOW_S),
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_LANES_WINDOW_S),
         end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0),
     )
-    lanes = rrb.StateTimelineView(
+    return rrb.StateTimelineView(
         origin="crossings",
         name="Crossings",
         time_ranges=[rrb.VisibleTimeRange(TIME, start=infinite, end=infinite)],
         time_view=rrb.TimeAxis(view_range=shown),
     )
-    return rrb.Vertical(places, lanes, row_shares=[2, 1])
 
 
 def _truck(vehicle: str, channels: Set[str]) -> rrb.Container:
     origin = f"vehicle/{vehicle}/acceleration"
-    plots = acceleration_plots(origin, channels, f"{vehicle}:", window_s=WINDOW_S)
+    plots = acceleration_plots(origin, channels, f"{vehicle}:", window_s=_WINDOW_S)
     return rrb.Vertical(*plots, name=vehicle)
 
 

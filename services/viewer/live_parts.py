@@ -108,7 +108,7 @@ def log_roads(stream: TimestampedStream, root: str, crossing: CrossingView) -> N
     road = crossing.road
     if road is None:
         return
-    largest_m = float(max(np.abs(road.front_m).max(), np.abs(road.rear_m).max(), 1e-6))
+    largest_m = max(road.largest_m, 1e-6)
     across = road.x_m * STRIP_WIDTH / crossing.span_m
     entity = f"{root}/strip/road"
     ends = [[(0.0, ROADS_MIDDLE), (float(STRIP_WIDTH), ROADS_MIDDLE)]]

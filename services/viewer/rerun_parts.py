@@ -48,6 +48,8 @@ UNKNOWN = "#CC79A7"
 _RATIO_COLOURS = ((0.8, (230, 159, 0)), (1.0, (86, 180, 233)))
 """Colours of relative EI on plan and map."""
 RATIO_LEGEND = "orange: EI / nominal ≤ 0.8"
+_BEHIND = 10.0
+"""Draw order of lines below others, whose default is 20."""
 
 
 def channel_colour(channel: str) -> str:
@@ -176,9 +178,19 @@ def log_strips(
     strips: Sequence[Any],
     colours: Sequence[Rgb],
     width: float,
+    *,
+    is_behind: bool = False,
 ) -> None:
-    """Draw lines in a 2-D view, with a colour for all or each, `width` points to each side."""
-    lines = rr.LineStrips2D(strips, colors=colours, radii=rr.Radius.ui_points(width))
+    """Draw lines in a 2-D view, with a colour for all or each, `width` points to each side.
+
+    With `is_behind` they are below all other lines; otherwise the order is undefined.
+    """
+    lines = rr.LineStrips2D(
+        strips,
+        colors=colours,
+        radii=rr.Radius.ui_points(width),
+        draw_order=_BEHIND if is_behind else None,
+    )
     recording.log(entity, lines, static=True)
 
 

@@ -2,7 +2,8 @@
 
 All parameters are on one scale, standard deviations of their own prior from its centre (of the
 logarithm, where the prior is log-normal). An interval as wide as the prior means no information, a
-point complete information; one at the prior's edge contradicts the site file.
+point complete information; one at the prior's edge contradicts the site file, but for the lower
+edge of a half-normal prior, whose likeliest value is 0.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ def _log(recording: RerunStream, scene: CrossingScene, rows: Sequence[PriorPoste
 
     down: FloatArray = _ROW * np.arange(len(rows), dtype=np.float64)
     priors = [[(row.prior[0], y), (row.prior[1], y)] for row, y in zip(rows, down, strict=True)]
-    log_strips(recording, f"{entity}/prior", priors, [rgb("#3a4148")], 5.0)
+    log_strips(recording, f"{entity}/prior", priors, [rgb("#3a4148")], 5.0, is_behind=True)
     colours = [colour(row) for row in rows]
     intervals = [[(row.low, y), (row.high, y)] for row, y in zip(rows, down, strict=True)]
     log_strips(recording, f"{entity}/interval", intervals, colours, 2.0)

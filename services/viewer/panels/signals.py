@@ -48,8 +48,10 @@ def _layout(scene: CrossingScene, shown: _Shown) -> rrb.Container:
     plots = acceleration_plots(f"{root}/acceleration", shown.channels)
     if shown.road is not None:
         apart = "Front minus rear" if first == 1 else f"Axle {first} minus axle {first + 1}"
+        # Of so low a plot Rerun writes one tick or two: the title has the scale.
+        reach_mm = f"± {1e3 * shown.road.largest_m:.1f} mm"
         plots = [
-            series_plot(f"{root}/road", "Road profile (mm)"),
+            series_plot(f"{root}/road", f"Road profile ({reach_mm})"),
             series_plot(f"{root}/road_difference", f"{apart} (mm)", has_legend=False),
             *plots,
         ]

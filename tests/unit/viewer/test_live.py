@@ -30,6 +30,7 @@ from services.cli import main as cli
 from services.common.errors import FailureError
 from services.viewer.crossing_view import elements_of_result
 from services.viewer.live import APPLICATION, live_command
+from services.viewer.live_layout import live_blueprint
 from services.viewer.live_parts import PERIOD_S, extremes
 from services.viewer.live_view import MAX_TRUCKS, LiveView
 from services.viewer.settings import ViewSettings
@@ -398,3 +399,12 @@ def test_a_port_that_is_taken_is_not_shared(tmp_path: Path) -> None:
         asked = ViewSettings(target="live", endpoint="tcp/127.0.0.1:1", serve=True, port=port)
         with pytest.raises(FailureError, match=f"port {port}: .*; give another --port"):
             live_command(asked, print)
+
+
+def test_the_name_of_a_state_of_three_seconds_fits_into_its_lane() -> None:
+    root: Any = live_blueprint({"truck-1": {"sprung_front"}}, ["bridge-1"], []).root_container
+    left = root.contents[0]
+    window = left.contents[-1].properties["TimeAxis"].view_range.as_arrow_array().to_pylist()[0]
+    shown_s = (window["end"] - window["start"]) / 1e9
+    width = 1400 * root.column_shares[0] / sum(root.column_shares)
+    assert width * 3.0 / shown_s > 85.0  # "on the bridge" in pixels

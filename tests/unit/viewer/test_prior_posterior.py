@@ -1,10 +1,17 @@
 """Intervals against priors, all on one scale."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
-from schemas.results import Prior
+from schemas.results import CrossingResult, Prior
+from schemas.site_file import load_site
 from services.viewer.crossing_view import ParameterRow
 from services.viewer.panels.learned import prior_posterior_rows
+from services.viewer.rerun_file import RerunContent, write_rrd
+from tests.unit.viewer.found import results_of, some_crossing
+from tests.viewer_screen import open_tab, opened, picture, pixels, view_named
 
 
 def row(name: str, low: float, mean: float, high: float, prior: Prior | None) -> ParameterRow:
@@ -59,3 +66,24 @@ def test_what_no_logarithm_has_stays_on_the_picture() -> None:
     wild, fixed = prior_posterior_rows(rows)
     assert (wild.low, wild.high) == (-4.5, 4.5)
     assert fixed.estimate == 0.0
+
+
+@pytest.mark.process
+def test_an_interval_is_drawn_over_its_prior(tmp_path: Path, project: Path) -> None:
+    site = load_site(project / "docs/site.example.toml")
+    (crossing,) = results_of(site, some_crossing("one")).crossings
+    values = crossing.model_dump()
+    ei = values["parameters"]["EI_1"]
+    ei["q025"], ei["q975"] = 0.6 * ei["q50"], 1.6 * ei["q50"]
+    ei["prior"] = log_normal(ei["q50"], 0.5).model_dump()
+    wide = CrossingResult.model_validate(values)
+    write_rrd(tmp_path / "wide.rrd", RerunContent({}, [wide], site))
+    with opened(tmp_path / "wide.rrd", tmp_path) as viewer:
+        viewer.set_time(play_state="paused")
+        open_tab(viewer, "Posterior and")
+        shown = pixels(picture(viewer, view_named(viewer, "Posterior and")))
+    blue = np.abs(shown - np.array([0x56, 0xB4, 0xE9]) / 255.0).max(axis=2) < 0.1
+    grey = np.abs(shown - np.array([0x3A, 0x41, 0x48]) / 255.0).max(axis=2) < 0.03
+    # The interval is half of its prior's bar, whose ends are round; the estimate alone is a dot.
+    widths = [np.ptp(np.flatnonzero(line.any(axis=0))) for line in (blue, grey)]
+    assert 0.4 < widths[0] / widths[1] < 0.6

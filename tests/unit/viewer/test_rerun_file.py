@@ -32,6 +32,7 @@ from services.viewer import rerun_file
 from services.viewer.crossing_scene import CrossingScene, crossing_root
 from services.viewer.crossing_view import CrossingView, front_axle_chainage, view_of_crossing
 from services.viewer.layout import blueprint
+from services.viewer.panels import signals
 from services.viewer.panels.verdict import verdict_markdown
 from services.viewer.rerun_file import RerunContent, write_rrd
 from services.viewer.rerun_parts import CHAINAGE
@@ -284,6 +285,15 @@ def test_ticks_of_chainage_count_from_a_round_place(drive):
         assert np.isnan(values[places.index(first_mm)])
         with_value = [place for place, value in zip(places, values, strict=True) if value == value]
         assert 0 <= min(with_value) - first_mm < 10_000
+
+
+def test_the_title_of_the_road_has_its_scale_which_a_low_plot_lacks(site: Site) -> None:
+    view = view_of_crossing(crossing(), site.bridges[0])
+    scene = CrossingScene(view, "root", None)
+    shown = signals.PANEL.data(scene)
+    assert shown is not None
+    titles = [plot.name for plot in signals.PANEL.layout(scene, shown).contents]
+    assert titles == ["Road profile (± 1.0 mm)", "Front minus rear (mm)"]
 
 
 def test_accelerations_say_when_the_truck_was_on_the_bridge(drive):
