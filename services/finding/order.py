@@ -8,6 +8,8 @@ those before it. The memory grows with the late messages, not with the length of
 recordings are kept and not read twice.
 """
 
+import logging
+import zlib
 from array import array
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
@@ -23,6 +25,10 @@ from services.finding.bridges import Bridges
 from services.finding.streams import device_time_ns
 
 STREAMS = ("accel", "gnss", "info")
+_log = logging.getLogger(__name__)
+
+_COMPARED = 256
+"""Number of sequence numbers at the start of a boot whose content is compared."""
 _SMALL_BYTES = 64 << 20
 """Size of the messages below which a recording is not read a second time."""
 _BESIDE_BYTES = 400
@@ -85,10 +91,12 @@ def index_messages(name: str, read: Read, site: Site) -> MessageIndex:
     infos: dict[tuple[_Truck, int], list[Message]] = {}
     near: list[Message] = []
     seen: set[str] = set()
+    repeated = _RepeatedStarts(name)
     for message in read():
         key = message.key
         if key.owner != "vehicle" or key.stream not in STREAMS:
             continue
+        repeated.check(message)
         seen.add(key.stream)
         if key.stream == "info":
             infos.setdefault((_truck(key), message.boot_id), []).append(message)
@@ -110,6 +118,31 @@ def index_messages(name: str, read: Read, site: Site) -> MessageIndex:
             raise InputError(f"{name}: no {what}, a recording of a truck is expected")
     order = {truck: _ranks(*two) for truck, two in made.items()}
     return MessageIndex(name, read, order, infos, near, {vehicle for _, vehicle in made})
+
+
+class _RepeatedStarts:
+    """Warning of two drives of a truck with one start, of which only the first counts."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._checksums: dict[tuple[Key, int, int], int] = {}
+        self._warned: set[_Truck] = set()
+
+    def check(self, message: Message) -> None:
+        """Warn once for each truck where a sequence number of a boot has two contents."""
+        if message.sequence >= _COMPARED:
+            return
+        identity = (message.key, message.boot_id, message.sequence)
+        checksum = zlib.crc32(message.payload)
+        truck = _truck(message.key)
+        if self._checksums.setdefault(identity, checksum) == checksum or truck in self._warned:
+            return
+        self._warned.add(truck)
+        _log.warning(
+            "%s: %s has two drives with the same start; only the first one counts "
+            "(driveby simulate --start gives another start)",
+            *(self._name, message.key.identifier),
+        )
 
 
 def in_measurement_order(overview: MessageIndex) -> Iterator[Message]:

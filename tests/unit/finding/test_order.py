@@ -151,3 +151,14 @@ def test_what_is_no_drive(sent: list[Message], said: str) -> None:
     with pytest.raises(InputError) as caught:
         index_messages("x.mcap", lambda: sent, SITE)
     assert str(caught.value).startswith(said)
+
+
+def test_second_drive_of_one_start_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    """Only the first counts, so the user must learn that the other is not identified."""
+    other = [one._replace(payload=one.payload + bytes((0x20, 5))) for one in a_drive(["a"], [7], 3)]
+    same = a_drive(["a", "b"], [7], 3)
+    index_messages("one.mcap", lambda: [*same, *same], SITE)
+    assert not caplog.records
+    index_messages("one.mcap, two.mcap", lambda: [*same, *other], SITE)
+    (warning,) = caplog.messages
+    assert warning.startswith("one.mcap, two.mcap: a has two drives with the same start; only the")
