@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
 _NS_PER_S: Final = 1_000_000_000  # schemas.signals has it too, and takes numpy to import
 _MAX_LINES: Final = 20
 """Maximum number of gaps and crossings of a recording in the listing."""
+
+
+_NEXT_FILE_NS: Final = 5 * _NS_PER_S
+"""Longest time between two recordings that each hold a part of a crossing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,7 +257,7 @@ def _print_table(found: "list[RecordingSummary]", unreadable: dict[Path, str]) -
     for path, error in unreadable.items():
         print(f"{path}: {error}")
     trucks = {truck.vehicle for one in found for truck in one.trucks}
-    crossings = sum(len(one.passings) for one in found)
+    crossings = _number_of_crossings(found)
     counts = [
         _count(len(found) + len(unreadable), "recording"),
         _size(sum(one.size_bytes for one in found)),
@@ -260,6 +265,33 @@ def _print_table(found: "list[RecordingSummary]", unreadable: dict[Path, str]) -
         _count(crossings, "crossing"),
     ]
     print(", ".join(counts))
+
+
+def _number_of_crossings(found: "list[RecordingSummary]") -> int:
+    """Return the number of crossings; one in several recordings, or cut by them, counts once."""
+    by_truck: dict[tuple[str, str, str, bool], list[DetectedCrossing]] = {}
+    for one in (passing for summary in found for passing in summary.passings):
+        name = (one.realm, one.vehicle, one.bridge, one.forward)
+        by_truck.setdefault(name, []).append(one)
+    return sum(
+        sum(not _is_same(*pair) for pair in pairwise(sorted(of_truck, key=_entry))) + 1
+        for of_truck in by_truck.values()
+    )
+
+
+def _entry(passing: "DetectedCrossing") -> int:
+    return passing.entry_ns
+
+
+def _is_same(earlier: "DetectedCrossing", later: "DetectedCrossing") -> bool:
+    """Return whether two recordings hold the same crossing, or the later one its rest."""
+    from services.finding.stays import are_one
+
+    return are_one(earlier.entry_ns, earlier.exit_ns, later.entry_ns, later.exit_ns) or (
+        earlier.passage.value == "ends on the bridge"
+        and later.passage.value == "begins on the bridge"
+        and later.entry_ns - earlier.exit_ns < _NEXT_FILE_NS
+    )
 
 
 def _number_of_gaps(one: "RecordingSummary") -> int:

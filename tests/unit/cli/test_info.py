@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from services.recordings.recording import read_info, read_messages
 from services.recordings.writer import write_recording
 from tests.builders.commands import run
 from tests.unit.drives.recorded import START_NS, drive
@@ -54,6 +55,25 @@ def test_a_folder_is_a_line_a_file_and_a_sum(
     assert none.startswith(f"{folder / 'none.mcap'}: is not an MCAP file")
     assert total.startswith("3 recordings, ")
     assert total.endswith(", 2 trucks, 0 crossings")
+
+
+def test_crossing_continued_in_the_next_file_counts_once(
+    capsys: pytest.CaptureFixture[str], project: Path, tmp_path: Path
+) -> None:
+    """A logger that was restarted during a crossing leaves two files with a part each."""
+    sample = project / "recordings/sample/crossing.mcap"
+    messages = list(read_messages(sample))
+    middle_ns = messages[0].log_time_ns + 4_400_000_000
+    site = read_info(sample).site_toml
+    for name, is_first in (("one", True), ("two", False)):
+        part = [m for m in messages if (m.log_time_ns < middle_ns) == is_first]
+        write_recording(tmp_path / f"{name}.mcap", part, site_toml=site, reason="test")
+    code, out, _ = run(capsys, "info", tmp_path)
+    _, first, second, total = out.splitlines()
+    assert (code, " 1 " in first, " 1 " in second) == (0, True, True)
+    assert total.endswith(", 1 truck, 1 crossing")
+    _, out, _ = run(capsys, "info", sample, tmp_path)
+    assert out.splitlines()[-1].endswith(", 1 truck, 1 crossing")
 
 
 def test_json_holds_all_fields(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
