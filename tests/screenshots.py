@@ -93,7 +93,7 @@ def main() -> int:
             takers[shown] = partial(take_picture, folder, pattern)
         of_sample = set(takers)
         takers["demo"] = partial(take_demo, folder)
-        takers["watch"] = partial(take_terminal, folder, columns=100)
+        takers["watch"] = partial(take_terminal, folder, columns=108)
         if SHARED.is_dir():
             takers |= {
                 shot.name: partial(take_shared, of, folder) for of, shot in OF_SHARED.items()
