@@ -12,22 +12,28 @@ Residuals w that are white but for this noise are whitened by
 
     w - C C' w,    C = U diag(1 - (1 + s²)^-1/2)^1/2,    B = U diag(s) V',
 
-because cov(w) = I + B B'. In the few bands in which the bridge responds, the noise is many times
-that of the sensors; it would be taken for damping or for support springs. All runs over one lane
-have the same e, so that it does not average out: in a fusion its power counts `RUNS` times.
+because cov(w) = I + B B'. The response to the force at each knot is computed once and serves this
+and the roughness of the deck (`pavement.estimate_pavement`): the bridge's response has waves as
+short as that roughness, and would be taken for it. In the few bands in which the bridge responds,
+the noise is many times that of the sensors; it would be taken for damping or for support springs.
+All runs over one lane have the same e, so that it does not average out: in a fusion its power
+counts `RUNS` times.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky, toeplitz
 
-from pre_core.crossing.mismatch import MismatchSpectra, density_at, pavement_ratio
+from pre_core.crossing.channels import A
+from pre_core.crossing.mismatch import density_at, hann_taper, pavement_ratio
 from pre_core.crossing.off_bridge import surface_level_at
-from pre_core.crossing.posterior import PosteriorProblem, data_rows, points
-from pre_core.crossing.whitening import Whitener
-from pre_core.physics.tandem import lead_response
+from pre_core.crossing.posterior import PosteriorProblem, filtered_rows, points
+from pre_core.crossing.residuals import roads_and_deflections
+from pre_core.crossing.tandem import lead_motion
+from pre_core.crossing.whitening import Whitener, project_out_noise, solve
+from pre_core.physics.tandem import lead_response, shared_load
 
 FloatArray = NDArray[np.float64]
 
@@ -38,36 +44,88 @@ _LONGEST_KNOTS = 160
 """Largest number of values of a force; a slower truck's counts up to a lower frequency."""
 _OVERSAMPLED = 16
 """Frequencies for each value in the integral of the covariance."""
-_KNOWN = 0.15
-"""Relative error of the force that nominal mass and tyre of the front axle leave."""
 _SMALLEST = 0.05
 """Smallest noise of a direction relative to the sensors' that is kept."""
 _JITTER = 1e-9
 
 
-def without_front_axle(
-    problem: PosteriorProblem, y: FloatArray, noise: Whitener, runs: float = 1.0
-) -> Whitener:
-    """Return the whitener with the front axle's noise at y (size,), `runs` times its power.
+class FrontAxleResponse(NamedTuple):
+    """Response of the filtered residuals to the errors of the front axle's inertia force."""
 
-    `noise` is that of the other sources. It is returned as it is for a truck without a tandem, or
-    without road off the bridge that shows how rough the surface is.
+    columns: FloatArray
+    """Residuals (3, m, K) in m for an acceleration of 1 m/s² at each knot."""
+    by_model: FloatArray
+    """Residuals (3, m, d) in m for a standard deviation of each value of the axle."""
+    apart_s: float
+    """Time between knots."""
+    surface_m2: float
+    """Phi k^3 of the surface."""
+
+
+def front_axle_response(problem: PosteriorProblem, y: FloatArray) -> FrontAxleResponse | None:
+    """Return the response at y (size,), while the front axle is on the bridge.
+
+    It is None for a truck without a tandem, without road off the bridge that shows how rough the
+    surface is, and if the truck at y has no residuals.
     """
-    shapes = problem.front_axle
-    surface = surface_level_at(problem, y) if shapes is not None else 0.0
-    noise = noise._replace(low_rank=np.zeros((0, 0)))
-    if shapes is None or not surface > 0.0:
-        return noise
-    motions = _motions(problem, y, shapes, runs * surface)
+    surface = surface_level_at(problem, y) if problem.front_axle is not None else 0.0
+    if not surface > 0.0:
+        return None
+    motions, apart_s = _unit_motions(problem, y)
     crossing = problem.crossing
-    still = problem._replace(noise=noise)
-    base = data_rows(still, y[None, :])[0]
-    columns = np.empty((base.size, motions.shape[1]))
+    base = filtered_rows(problem, y)
+    columns = np.empty((*base.shape, motions.shape[1]))
     for k in range(motions.shape[1]):
         moved = crossing._replace(lead_acceleration=crossing.lead_acceleration + motions[:, k])
-        columns[:, k] = data_rows(still._replace(crossing=moved), y[None, :])[0] - base
-    if not np.isfinite(columns).all():
+        columns[:, :, k] = filtered_rows(problem._replace(crossing=moved), y) - base
+    by_model = np.empty((*base.shape, len(problem.displaced_leads)))
+    nominal = filtered_rows(with_lead_motion(problem, y), y)
+    for k, lead in enumerate(problem.displaced_leads):
+        other = with_lead_motion(problem._replace(crossing=crossing._replace(lead=lead)), y)
+        by_model[:, :, k] = filtered_rows(other, y) - nominal
+    if not (columns.size and np.isfinite(columns).all() and np.isfinite(by_model).all()):
+        return None
+    return FrontAxleResponse(columns, by_model, apart_s, surface)
+
+
+def mismatch_power(
+    problem: PosteriorProblem, response: FrontAxleResponse, some: NDArray[np.int64]
+) -> tuple[FloatArray, FloatArray]:
+    """Return two expected tapered periodograms (f,) of the axle's noise in mismatch residuals.
+
+    They are of the successive residuals `some` (m,), see `tapered_periodogram`. The first is
+    caused by a surface on the bridge as rough as off it, the second by errors of the axle's values.
+    """
+    taper = hann_taper(some.size)[:, None]
+    of_knots = np.fft.rfft(taper * response.columns[0, some], axis=0)[1:]
+    of_values = np.fft.rfft(taper * response.by_model[0, some], axis=0)[1:]
+    covariance = _covariance(problem, response)
+    by_surface = np.einsum("fk,kl,fl->f", of_knots, covariance, of_knots.conj(), optimize=True)
+    return by_surface.real, np.sum(np.abs(of_values) ** 2, axis=1)
+
+
+def without_front_axle(
+    problem: PosteriorProblem,
+    response: FrontAxleResponse | None,
+    noise: Whitener,
+    runs: float = 1.0,
+) -> Whitener:
+    """Return the whitener with the front axle's noise, `runs` times its power.
+
+    `noise` is that of the other sources. It is returned as it is without a `response`.
+    """
+    noise = noise._replace(low_rank=np.zeros((0, 0)))
+    if response is None:
         return noise
+    covariance = _covariance(problem, response)
+    covariance[np.diag_indices_from(covariance)] *= 1.0 + _JITTER
+    root = pavement_ratio(problem.mismatch) * cholesky(covariance, lower=True)
+    forced = np.concatenate([response.columns @ root, response.by_model], axis=2)
+    forced = np.sqrt(runs) * np.moveaxis(forced, 0, 1).reshape(-1, forced.shape[2])
+    rows = np.ascontiguousarray(forced.T)
+    for row in rows:
+        solve(noise.factor, noise.reciprocal, row)
+    columns = project_out_noise(noise, rows).T
     left, size, _ = np.linalg.svd(columns, full_matrices=False)
     left[~columns.any(axis=1)] = 0.0  # residuals that do not exist, but for rounding
     kept = size > _SMALLEST
@@ -75,12 +133,10 @@ def without_front_axle(
     return noise._replace(low_rank=np.ascontiguousarray(left[:, kept] * taken))
 
 
-def _motions(
-    problem: PosteriorProblem, y: FloatArray, shapes: MismatchSpectra, surface: float
-) -> FloatArray:
-    """Return accelerations (n, K) in m/s² of the axle, whose sum with unit weights has its error.
+def _unit_motions(problem: PosteriorProblem, y: FloatArray) -> tuple[FloatArray, float]:
+    """Return accelerations (n, K) of 1 m/s² at one knot each, and the time between knots.
 
-    `surface` is Phi k^3 in m². They are zero off the bridge.
+    They are zero off the bridge.
     """
     crossing = problem.crossing
     at = points(problem, y[None, :])
@@ -88,33 +144,58 @@ def _motions(
     on = np.flatnonzero((chainage >= 0.0) & (chainage <= crossing.span_m))
     out = np.zeros((chainage.size, 0))
     if on.size < 2:
-        return out
+        return out, 0.0
     lasts_s = (on[-1] - on[0]) * crossing.step_s
     highest_hz = min(_HIGHEST_HZ, 0.5 * _LONGEST_KNOTS / lasts_s)
     apart_s = 0.5 / highest_hz
     count = int(np.ceil(lasts_s / apart_s)) + 1
-    hz = highest_hz * (np.arange(_OVERSAMPLED * count) + 0.5) / (_OVERSAMPLED * count)
-    power = _acceleration_power(problem, shapes, surface, hz)
-    lags = apart_s * np.arange(count)
-    row = np.cos(2.0 * np.pi * np.outer(lags, hz)) @ power * (hz[1] - hz[0])
-    row[0] *= 1.0 + _JITTER
-    root = cholesky(toeplitz(row), lower=True)
     time = crossing.step_s * (on - on[0])
     out = np.zeros((chainage.size, count))
-    out[on] = np.sinc(time[:, None] / apart_s - np.arange(count)) @ root
-    return out
+    out[on] = np.sinc(time[:, None] / apart_s - np.arange(count))
+    return out, apart_s
 
 
-def _acceleration_power(
-    problem: PosteriorProblem, shapes: MismatchSpectra, surface: float, hz: FloatArray
-) -> FloatArray:
+def _covariance(problem: PosteriorProblem, response: FrontAxleResponse) -> FloatArray:
+    """Return the covariance (K, K) in m²/s^4 of the acceleration's error at the knots.
+
+    The surface under the axle is as rough as off the bridge.
+    """
+    count, apart_s = response.columns.shape[2], response.apart_s
+    highest_hz = 0.5 / apart_s
+    hz = highest_hz * (np.arange(_OVERSAMPLED * count) + 0.5) / (_OVERSAMPLED * count)
+    turns = np.cos(2.0 * np.pi * np.outer(apart_s * np.arange(count), hz)) * (hz[1] - hz[0])
+    return np.asarray(toeplitz(turns @ _acceleration_power(problem, response.surface_m2, hz)))
+
+
+def _acceleration_power(problem: PosteriorProblem, surface: float, hz: FloatArray) -> FloatArray:
     """Return the one-sided spectrum (f,) in m²/s^4/Hz of the error of the axle's acceleration."""
+    shapes = problem.front_axle
+    assert shapes is not None  # noqa: S101 - there is a response
     omega = 2.0 * np.pi * hz
     road = problem.mismatch._replace(shapes=shapes)
-    # The window, which keeps covariances short, would spread the profile's long waves.
-    table = np.concatenate([shapes.density, (shapes.road / shapes.road_spread)[None, :]])
-    weights = surface * np.append(shapes.expected_m, _KNOWN**2)
-    weights[:-1] *= pavement_ratio(problem.mismatch) ** 2
-    profile = weights @ density_at(road, omega, table)
+    profile = surface * shapes.expected_m @ density_at(road, omega, shapes.density)
     answer = np.abs(lead_response(problem.crossing.lead, omega)) ** 2
     return np.asarray(omega**4 * answer * profile)
+
+
+def with_lead_motion(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
+    """Return the problem with the motion of the axle ahead of the tandem, at y (size,)."""
+    crossing = problem.crossing
+    at = points(problem, y[None, :])
+    work = problem.works[0]
+    work.under_lead[:] = 0.0
+    heights, _ = roads_and_deflections(crossing, work, at, 0)
+    chainage = at.position_m[0] * crossing.direction
+    ahead = chainage + crossing.lead.ahead_m
+    profile = 0.5 * (
+        np.interp(ahead, chainage, heights[0])
+        + np.interp(ahead, chainage - float(at.wheelbase_m[0]), heights[1])
+    )
+    on = shared_load(crossing.lead, at.theta[0], crossing.total_mass_kg, float(at.wheelbase_m[0]))
+    force = on.lead_1 * crossing.signals[0, A] + on.lead_2 * crossing.signals[1, A]
+    if not crossing.lead.is_equalised:
+        own = crossing.lead.unsprung_mass_kg * crossing.lead_acceleration
+        static = (on.lead_kg + crossing.lead.unsprung_mass_kg) * crossing.gravity_m_per_s2
+        force = -work.load[2] - own - static / float(at.common_gain[0])
+    motion = lead_motion(crossing.lead, crossing.step_s, profile + work.under_lead, force)
+    return problem._replace(crossing=crossing._replace(lead_acceleration=motion))

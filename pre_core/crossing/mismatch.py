@@ -277,6 +277,12 @@ class PeriodogramSegment(NamedTuple):
     shapes: FloatArray
 
 
+def hann_taper(count: int) -> FloatArray:
+    """Return a Hann taper (count,) of unit energy without zeros."""
+    taper = np.hanning(count + 2)[1:-1]
+    return np.asarray(taper / np.sqrt(taper @ taper))
+
+
 def tapered_periodogram(
     values: FloatArray, sensors: FloatArray, shapes: FloatArray
 ) -> PeriodogramSegment:
@@ -286,8 +292,7 @@ def tapered_periodogram(
     of each shape (the debiased periodogram of Sykulski et al. 2019).
     """
     m = values.size
-    taper = np.hanning(m + 2)[1:-1]
-    taper /= np.sqrt(taper @ taper)
+    taper = hann_taper(m)
     seen = np.abs(np.fft.rfft(taper * values)[1:]) ** 2
     size = 2 * m
     # Overlap of the taper with itself, lag by lag.

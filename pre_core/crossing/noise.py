@@ -67,9 +67,8 @@ FRICTION_STATISTIC, FRICTION_STATISTIC_OF_MISFIT = 60.0, 15.0
 suspension equations: the second where nothing else explains a misfit. Of 400 axles with sensor
 noise alone twelve had more than 15, none more than 60."""
 _EQUAL_TYRES = 0.05
-"""Sensitivity to the mismatch of unequal tyres below which tyres count as equal; the visible part
-is then an axle's offset, whose long waves are twice as large, and short ones hardly distinguish
-them."""
+"""Sensitivity to unequal tyres below which tyres count as equal; the mismatch is then an axle's
+offset, whose long waves are twice as large, and which short ones hardly distinguish."""
 
 
 class NoisePath(NamedTuple):
@@ -336,11 +335,14 @@ def mismatch_levels(
     road: Mismatch,
     stretches: list[FloatArray],
     roads: list[FloatArray],
+    *,
+    has_only_offset: bool = False,
 ) -> tuple[FloatArray, float, FloatArray]:
     """Return levels (s,) in m³ of segments of mismatch residuals, and a statistic.
 
     The statistic is that of their likelihood over zero (`whittle`); the third value holds the
-    levels (s,) of the declared axles on a surface as rough as the road.
+    levels (s,) of the declared axles on a surface as rough as the road. With `has_only_offset` the
+    level of unequal tyres is zero.
 
     Each segment (m,) has consecutive filtered residuals unaffected by a bridge; `roads` are
     residuals of one axle's profile there, treated as the front one, which bound an axle's offset.
@@ -348,9 +350,8 @@ def mismatch_levels(
     omega, shapes = rows.omega, road.shapes
     table = np.concatenate([shapes.density, shapes.road[None, :]])
     shape = omega**4 * _mismatch.density_at(road, omega, table) * rows.power
-    longest = max(stretch.size for stretch in stretches)
-    memory = min(_mismatch.correlation_time_s(road), longest * rows.every * rows.step_s)
-    turn = phases(rows, memory)
+    longest_s = rows.every * rows.step_s * max(stretch.size for stretch in stretches)
+    turn = phases(rows, min(_mismatch.correlation_time_s(road), longest_s))
     sensors = noise_spectrum(truck, density, no_suspension_noise(), None, omega)[0, 0].real
     of_sensors, of_shapes = ((sensors * rows.power) @ turn).real, (shape @ turn).real
     whole = [_mismatch.tapered_periodogram(one, of_sensors, of_shapes[-1:]) for one in roads]
@@ -359,12 +360,13 @@ def mismatch_levels(
     expected = surface * shapes.expected_m
     usual = np.array([np.inf, expected[1]])
     parts = [_mismatch.tapered_periodogram(one, of_sensors, of_shapes[:-1]) for one in stretches]
-    level, statistic = _mismatch.estimate_levels(parts, usual)
-    if level[0] >= _EQUAL_TYRES * expected[0]:
-        return level, statistic, expected
+    if not has_only_offset:
+        level, statistic = _mismatch.estimate_levels(parts, usual)
+        if level[0] >= _EQUAL_TYRES * expected[0]:
+            return level, statistic, expected
     alike = [part._replace(shapes=part.shapes[1:]) for part in parts]
-    level, statistic = _mismatch.estimate_levels(alike, usual[1:])
-    return np.concatenate([[0.0], level]), statistic, expected
+    offset, statistic = _mismatch.estimate_levels(alike, usual[1:])
+    return np.append(0.0, offset), statistic, expected
 
 
 def suspension_noise_levels(

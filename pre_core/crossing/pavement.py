@@ -14,9 +14,11 @@ an end exceed the noise, all local waves there are removed from the whitened res
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pre_core.crossing import mismatch as _mismatch
-from pre_core.crossing.mismatch import BridgePavement, Mismatch
+from pre_core.crossing.front_axle import FrontAxleResponse, mismatch_power
+from pre_core.crossing.mismatch import BridgePavement, Mismatch, PeriodogramSegment
 from pre_core.crossing.noise import no_suspension_noise, noise_spectrum
 from pre_core.crossing.off_bridge import FEWEST_ROWS, rear_axle_chainage_m, rear_axle_samples_m
 from pre_core.crossing.posterior import PosteriorProblem, filtered_rows, noise_path_at
@@ -45,37 +47,52 @@ _CLEAR_JOINT = 8.0
 
 
 def estimate_pavement(
-    problem: PosteriorProblem, y: FloatArray, level_m3: FloatArray
+    problem: PosteriorProblem,
+    y: FloatArray,
+    level_m3: FloatArray,
+    front_axle: FrontAxleResponse | None = None,
 ) -> BridgePavement:
-    """Return the mismatch on the bridge relative to levels (s,) off it, at y (size,)."""
+    """Return the mismatch on the bridge relative to levels (s,) off it, at y (size,).
+
+    The noise by the front axle of a tandem has waves as short, and is as rough as the deck.
+    """
     inside = _distance_inside_m(problem, y)
     share = _share_on_bridge(inside)
     road = problem.mismatch._replace(level_m3=level_m3)
     rows = problem.rows
     half_m = 0.5 * rows.taps.size * rows.step_s * road.speed_m_per_s
-    stretch = filtered_rows(problem, y)[0][inside > half_m + _JOINT_M]
-    if stretch.size < FEWEST_ROWS:
+    middle = np.flatnonzero(inside > half_m + _JOINT_M)
+    if middle.size < FEWEST_ROWS:
         prior = np.diag([RATIO_SPREAD**2, TILT_SPREAD**2])
         return BridgePavement(np.zeros(2), prior, share)
-    omega = rows.omega
-    density = level_m3 @ _mismatch.density_at(road, omega, road.shapes.density)
+    part = _periodogram(problem, y, road, middle)
+    known, shape = part.sensors, part.shapes[0]
+    if front_axle is not None:
+        by_surface, by_model = mismatch_power(problem, front_axle, middle)
+        known, shape = known + by_model, shape + by_surface
+    length_m = middle.size * rows.every * rows.step_s * road.speed_m_per_s
+    n = np.arange(1, part.seen.size + 1) / length_m
+    low, high = _SHORT_CYCLES_PER_M
+    short = (n > low) & (n < high)
+    found, covariance = fit_ratio(part.seen[short], known[short], shape[short], n[short])
+    return BridgePavement(found, covariance, share)
+
+
+def _periodogram(
+    problem: PosteriorProblem, y: FloatArray, road: Mismatch, some: NDArray[np.int64]
+) -> PeriodogramSegment:
+    """Return the periodogram of successive mismatch residuals `some` (m,), as on the road."""
+    rows, omega = problem.rows, problem.rows.omega
+    density = road.level_m3 @ _mismatch.density_at(road, omega, road.shapes.density)
     truck, sensor = noise_path_at(problem, y)
     of_sensors = noise_spectrum(truck, sensor, no_suspension_noise(), None, omega)[0, 0].real
-    apart_s = rows.every * rows.step_s
-    memory = min(_mismatch.correlation_time_s(road), stretch.size * apart_s)
+    memory = min(_mismatch.correlation_time_s(road), some.size * rows.every * rows.step_s)
     turn = phases(rows, memory)
-    part = _mismatch.tapered_periodogram(
-        stretch,
+    return _mismatch.tapered_periodogram(
+        filtered_rows(problem, y)[0, some],
         ((of_sensors * rows.power) @ turn).real,
         ((omega**4 * density * rows.power) @ turn).real[None, :],
     )
-    n = np.arange(1, part.seen.size + 1) / (stretch.size * apart_s * road.speed_m_per_s)
-    low, high = _SHORT_CYCLES_PER_M
-    short = (n > low) & (n < high)
-    found, covariance = fit_ratio(
-        part.seen[short], part.sensors[short], part.shapes[0, short], n[short]
-    )
-    return BridgePavement(found, covariance, share)
 
 
 def known_pavement(problem: PosteriorProblem, y: FloatArray, ratio: float) -> BridgePavement:

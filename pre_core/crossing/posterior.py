@@ -31,6 +31,7 @@ from pre_core.crossing.residuals import (
 from pre_core.crossing.rows import RESIDUALS, RowFilter, filter_rows, row_count
 from pre_core.crossing.whitening import Whitener
 from pre_core.parameters import EI_1, K_U1, M_U1
+from pre_core.physics.tandem import Lead
 
 FloatArray = NDArray[np.float64]
 
@@ -105,6 +106,8 @@ class PosteriorProblem(NamedTuple):
     """(m, w) orthonormal waves of these lines."""
     front_axle: MismatchSpectra | None = None
     """Spectra of the profile of the axle ahead of a tandem less that of the tandem."""
+    displaced_leads: tuple[Lead, ...] = ()
+    """Front axles with one value displaced by the standard deviation of its prior."""
 
 
 def has_tandem(problem: PosteriorProblem) -> bool:

@@ -9,7 +9,12 @@ from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import lines
 from pre_core.crossing.arguments import EvaluationPoints, GriddedCrossing, allocate_buffers
 from pre_core.crossing.channels import A, GainsAndDelays, ModelSignals, channel_signals
-from pre_core.crossing.front_axle import without_front_axle
+from pre_core.crossing.front_axle import (
+    FrontAxleResponse,
+    front_axle_response,
+    with_lead_motion,
+    without_front_axle,
+)
 from pre_core.crossing.mismatch import BridgePavement, Mismatch, mismatch_spectra
 from pre_core.crossing.noise import (
     FRICTION_STATISTIC,
@@ -35,17 +40,15 @@ from pre_core.crossing.posterior import (
     starting_point,
     trajectory_basis,
 )
-from pre_core.crossing.residuals import roads_and_deflections
 from pre_core.crossing.rows import RESIDUALS, row_count, row_filter
 from pre_core.crossing.step_tables import sinc_table, step_table
 from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_FACTOR
-from pre_core.crossing.tandem import lead_motion
 from pre_core.crossing.whitening import Whitener, solve, whitener
 from pre_core.parameters import FIRST_OF_BRIDGE, TORSION
 from pre_core.physics.beam_basis import beam_basis, change_basis
 from pre_core.physics.bridge import FloatArray
 from pre_core.physics.surface import TYPICAL_FOOTPRINTS, Footprint
-from pre_core.physics.tandem import NO_LEAD, Lead, shared_load
+from pre_core.physics.tandem import NO_LEAD, Lead
 from pre_core.physics.torsion import NO_TORSION, TorsionBasis, torsion_basis
 
 _KNOT_S = 0.4
@@ -88,6 +91,8 @@ class CrossingInputs(NamedTuple):
     are then those of the tandem, whose first axle is the front one."""
     lead_footprint: Footprint = TYPICAL_FOOTPRINTS[0]
     """Footprint of that front axle."""
+    displaced_leads: tuple[Lead, ...] = ()
+    """Front axles with one value displaced by the standard deviation of its prior."""
 
 
 def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]:
@@ -139,6 +144,7 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
             if inputs.lead.ahead_m > 0.0
             else None
         ),
+        displaced_leads=inputs.displaced_leads,
     )
     return problem, starting_point(problem, best)
 
@@ -223,7 +229,7 @@ def update_noise(
     unknowns = where.gains.stop
     if has_tandem(problem):
         force = no_suspension_noise() if problem.crossing.lead.is_equalised else force
-        problem = _with_lead_motion(problem, y)
+        problem = with_lead_motion(problem, y)
     if force is None:
         body = filtered_rows(problem, y)[1:]
         force = suspension_noise_levels(
@@ -234,17 +240,17 @@ def update_noise(
         if mismatch.any():
             mismatch = levels_at(problem, y)
     differs = bool(mismatch.any())
+    front_axle = front_axle_response(problem, y)
     if differs and pavement is None:
-        pavement = estimate_pavement(problem, y, mismatch)
+        pavement = estimate_pavement(problem, y, mismatch, front_axle)
     road = problem.mismatch._replace(level_m3=mismatch, pavement=pavement if differs else None)
-    is_inertial = bool(force.any())
-    at, trucks = _displaced_points(problem, y, unknowns, is_inertial=is_inertial)
+    at, trucks = _displaced_points(problem, y, unknowns, is_inertial=bool(force.any()))
     density = problem.density * (1.0 + at.gain)
     count = row_count(problem.rows, problem.crossing.rows)
     residual_force = REDUCED_WEIGHT_FACTOR * force
     profile_noise = road if differs else None
     noise = whitener(problem.rows, count, trucks[0], density[0], residual_force, profile_noise)
-    noise = _with_local_noise(problem._replace(mismatch=road), y, noise)
+    noise = _with_local_noise(problem._replace(mismatch=road), y, noise, front_axle)
     truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
     changing = [*range(truck), *range(where.wheelbase, unknowns)]
     slope = np.zeros(unknowns)
@@ -262,31 +268,8 @@ def update_noise(
         force=force,
         mismatch=road,
         noise_slope=slope,
-        crossing=problem.crossing._replace(basis=basis, is_inertial=is_inertial),
+        crossing=problem.crossing._replace(basis=basis, is_inertial=bool(force.any())),
     )
-
-
-def _with_lead_motion(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
-    """Return the problem with the motion of the axle ahead of the tandem, over the profile at y."""
-    crossing = problem.crossing
-    at = points(problem, y[None, :])
-    work = problem.works[0]
-    work.under_lead[:] = 0.0
-    heights, _ = roads_and_deflections(crossing, work, at, 0)
-    chainage = at.position_m[0] * crossing.direction
-    ahead = chainage + crossing.lead.ahead_m
-    profile = 0.5 * (
-        np.interp(ahead, chainage, heights[0])
-        + np.interp(ahead, chainage - float(at.wheelbase_m[0]), heights[1])
-    )
-    on = shared_load(crossing.lead, at.theta[0], crossing.total_mass_kg, float(at.wheelbase_m[0]))
-    force = on.lead_1 * crossing.signals[0, A] + on.lead_2 * crossing.signals[1, A]
-    if not crossing.lead.is_equalised:
-        own = crossing.lead.unsprung_mass_kg * crossing.lead_acceleration
-        static = (on.lead_kg + crossing.lead.unsprung_mass_kg) * crossing.gravity_m_per_s2
-        force = -work.load[2] - own - static / float(at.common_gain[0])
-    motion = lead_motion(crossing.lead, crossing.step_s, profile + work.under_lead, force)
-    return problem._replace(crossing=crossing._replace(lead_acceleration=motion))
 
 
 def replace_mismatch(
@@ -305,17 +288,22 @@ def replace_mismatch(
         REDUCED_WEIGHT_FACTOR * problem.force,
         mismatch,
     )
-    return problem._replace(noise=_with_local_noise(problem, y, noise, runs))
+    front_axle = front_axle_response(problem, y)
+    return problem._replace(noise=_with_local_noise(problem, y, noise, front_axle, runs))
 
 
 def _with_local_noise(
-    problem: PosteriorProblem, y: FloatArray, noise: Whitener, runs: float = 1.0
+    problem: PosteriorProblem,
+    y: FloatArray,
+    noise: Whitener,
+    front_axle: FrontAxleResponse | None,
+    runs: float = 1.0,
 ) -> Whitener:
     """Return the whitener without lines and joints, and with the noise by a tandem's front axle."""
     noise = _without_lines(problem, noise)
     if problem.mismatch.level_m3.any():
         noise = without_joints(problem, y, noise)
-    return without_front_axle(problem, y, noise, runs)
+    return without_front_axle(problem, front_axle, noise, runs)
 
 
 def strongest_line_at_hz(problem: PosteriorProblem, y: FloatArray) -> float:

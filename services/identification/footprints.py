@@ -67,6 +67,26 @@ def lead_of(vehicle: Vehicle) -> Lead:
     )
 
 
+def displaced_leads_of(vehicle: Vehicle) -> tuple[Lead, ...]:
+    """Return the axle ahead of a tandem with mass, tyre and tyre damping displaced one by one.
+
+    Each is displaced by the standard deviation of its prior. There are none without a tandem.
+    """
+    tandem, lead = vehicle.tandem, lead_of(vehicle)
+    if tandem is None:
+        return ()
+
+    def displaced(key: str) -> float:
+        nominal = float(getattr(tandem.lead, key))
+        return nominal * (1.0 + vehicle.spread(key)) if nominal else vehicle.scale_at_zero(key)
+
+    return (
+        lead._replace(unsprung_mass_kg=displaced("unsprung_mass_kg")),
+        lead._replace(tyre_stiffness_n_per_m=displaced("tyre_stiffness_n_per_m")),
+        lead._replace(tyre_damping_ns_per_m=displaced("tyre_damping_ns_per_m")),
+    )
+
+
 def _of_axle(axle: Axle, usually: str = "twin") -> Footprint:
     """Return the footprint of an axle, `usually` "twin" or "single" without declared tyres."""
     kind = axle.tyres or ("single" if axle.twin_tyre_distance_m == 0.0 else usually)

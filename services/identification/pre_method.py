@@ -30,7 +30,12 @@ from services.finding.crossing_data import CrossingData
 from services.finding.placed import first_axle
 from services.identification.checks import stiffer_elements, undeclared_axles
 from services.identification.fit_reasons import reasons_of_fit
-from services.identification.footprints import footprints_of, lead_footprint_of, lead_of
+from services.identification.footprints import (
+    displaced_leads_of,
+    footprints_of,
+    lead_footprint_of,
+    lead_of,
+)
 from services.identification.fusing import stored
 from services.identification.lane import lane_factor
 from services.identification.result_parts import (
@@ -141,6 +146,7 @@ def inputs_of(
         lane_factor(data),
         lead,
         lead_footprint_of(vehicle),
+        displaced_leads_of(vehicle),
     )
 
 

@@ -12,8 +12,10 @@ import pytest
 
 from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import front_axle, posterior
+from pre_core.crossing.mismatch import BridgePavement, tapered_periodogram
 from pre_core.crossing.noise import no_suspension_noise
-from pre_core.crossing.off_bridge import off_bridge_residuals, surface_level_at
+from pre_core.crossing.off_bridge import _levels_off_bridge, off_bridge_residuals
+from pre_core.crossing.pavement import estimate_pavement
 from pre_core.crossing.posterior import ChainageFixes, PosteriorProblem, Priors
 from pre_core.crossing.preparation import (
     CrossingInputs,
@@ -362,9 +364,10 @@ def test_noise_of_the_front_axle_is_white_once_whitened() -> None:
     problem, y = on_a_surface(0.1)
     crossing = problem.crossing
     still = with_known_front_axle(problem)
-    shapes = problem.front_axle
-    assert shapes is not None
-    motions = front_axle._motions(still, y, shapes, surface_level_at(still, y))
+    response = front_axle.front_axle_response(still, y)
+    assert response is not None
+    root = np.linalg.cholesky(front_axle._covariance(still, response))
+    motions = front_axle._unit_motions(still, y)[0] @ root
     rng = np.random.default_rng(4)
     base = posterior.data_rows(still, y[None, :])[0]
     columns = problem.noise.low_rank
@@ -381,10 +384,82 @@ def test_noise_of_the_front_axle_is_white_once_whitened() -> None:
     assert power == pytest.approx(np.ones(power.size), abs=5.0 * np.sqrt(2.0 / len(powers)))
 
 
+def test_waves_by_the_front_axle_are_no_roughness_of_the_deck() -> None:
+    problem, y = on_a_surface()
+    level = _levels_off_bridge(problem, y)[0]
+    response = front_axle.front_axle_response(problem, y)
+    assert response is not None
+
+    def in_spreads(pavement: BridgePavement) -> np.ndarray:
+        return pavement.ratio_and_tilt / np.sqrt(np.diag(pavement.covariance))
+
+    # The deck is as rough as the road: both are zero.
+    assert in_spreads(estimate_pavement(problem, y, level))[0] > 3.0
+    assert np.abs(in_spreads(estimate_pavement(problem, y, level, response))).max() < 2.0
+    used = update_noise(problem, y, mismatch=level).mismatch.pavement
+    assert used is not None
+    assert np.abs(in_spreads(used)).max() < 2.0
+
+
+def test_equal_tyres_of_a_tandem_differ_by_an_offset_only() -> None:
+    problem, y = on_a_surface()
+    levels = _levels_off_bridge(problem, y)[0]
+    assert levels[0] == 0.0 < levels[1]
+
+
+def test_power_of_the_front_axle_is_that_of_its_noise_in_the_mismatch() -> None:
+    problem, y = on_a_surface()
+    response = front_axle.front_axle_response(problem, y)
+    assert response is not None
+    before, behind = off_bridge_residuals(problem, y)
+    some = np.arange(before.stop, behind.start)
+    rng = np.random.default_rng(7)
+    covariance = front_axle._covariance(problem, response)
+    weights = rng.multivariate_normal(np.zeros(len(covariance)), covariance, 400)
+    noise = (response.columns[0] @ weights.T)[some]
+    nothing = np.zeros((1, 1))
+    seen = [tapered_periodogram(one, nothing[0], nothing).seen for one in noise.T]
+    expected, by_model = front_axle.mismatch_power(problem, response, some)
+    clear = expected > 1e-3 * expected.max()
+    assert np.mean(seen, axis=0)[clear] == pytest.approx(expected[clear], rel=0.3)
+    assert not by_model.any()
+
+
+def test_wrong_mass_and_tyre_of_the_front_axle_are_its_noise() -> None:
+    of = driven()
+    true = lead_of(of.case.truck)
+    wrong = true._replace(
+        unsprung_mass_kg=1.15 * true.unsprung_mass_kg,
+        tyre_stiffness_n_per_m=0.9 * true.tyre_stiffness_n_per_m,
+    )
+    displaced = (
+        wrong._replace(unsprung_mass_kg=1.1 * wrong.unsprung_mass_kg),
+        wrong._replace(tyre_stiffness_n_per_m=1.1 * wrong.tyre_stiffness_n_per_m),
+    )
+
+    def power(leads: tuple[Lead, ...]) -> float:
+        problem, y = build_problem(inputs_of(of)._replace(lead=wrong, displaced_leads=leads))
+        # Both axles feel one road: no other noise of the front axle.
+        none = np.zeros_like(problem.mismatch.level_m3)
+        shapes = problem.front_axle
+        assert shapes is not None
+        same = shapes._replace(density=1e-9 * shapes.density)
+        problem = problem._replace(front_axle=same)
+        for _ in range(2):
+            problem = update_noise(problem, y, mismatch=none)
+        before, behind = off_bridge_residuals(problem, y)
+        white = posterior.data_rows(problem, y[None, :])[0, ::RESIDUALS]
+        return float(np.mean(white[before.stop : behind.start] ** 2))
+
+    assert power(displaced) < 0.2 * power(())
+
+
 def test_front_axle_counts_for_each_run_in_a_fusion() -> None:
     problem, y = on_a_surface()
     one = problem.noise.low_rank
-    many = front_axle.without_front_axle(problem, y, problem.noise, front_axle.RUNS).low_rank
+    response = front_axle.front_axle_response(problem, y)
+    noise = front_axle.without_front_axle(problem, response, problem.noise, front_axle.RUNS)
+    many = noise.low_rank
     assert many.shape[1] >= one.shape[1] > 10
     assert np.sum(many**2) > 1.2 * np.sum(one**2)
     problem, y = build_problem(inputs_of(driven())._replace(lead=NO_LEAD))
