@@ -38,9 +38,9 @@ def test_every_picture_can_be_made_and_shows_something(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.process
-@pytest.mark.parametrize(("name", "orange"), [("d3_edge", 0.002), ("d9_everything", 0.002)])
+@pytest.mark.parametrize(("name", "has_weak"), [("d3_edge", True), ("d9_everything", False)])
 def test_bridges_of_many_crossings_can_be_shown(
-    shared: Path, tmp_path: Path, name: str, orange: float
+    shared: Path, tmp_path: Path, name: str, has_weak: bool
 ) -> None:
     assert screenshots.SHARED.is_relative_to(shared)
     if not has_driver():
@@ -49,7 +49,8 @@ def test_bridges_of_many_crossings_can_be_shown(
     taken = pixels(screenshots.smaller(screenshots.take_shared(which, tmp_path)))
     assert (taken.min(axis=2) > 0.95).mean() > 0.3  # the white picture of the bridge
     weak = np.abs(taken - np.array([230, 159, 0]) / 255.0).max(axis=2) < 0.05
-    assert weak.mean() > orange  # the weak element's bar
+    # The weak element's bar; of the many its neighbours and it are not resolved.
+    assert weak.mean() > 0.002 if has_weak else not weak.any()
 
 
 @pytest.mark.slow
