@@ -59,7 +59,7 @@ class ReplaySettings:
     topics: tuple[str, ...] = opt(
         f"topics to publish: {_PATTERNS} (accel,gnss or vehicle/*/accel)",
         names,
-        group="messages",
+        group="selection",
         default=(),
         action="extend",
         metavar="PATTERN",
@@ -67,7 +67,7 @@ class ReplaySettings:
     exclude: tuple[str, ...] = opt(
         "topics to leave out, given as for --topics",
         names,
-        group="messages",
+        group="selection",
         default=(),
         action="extend",
         metavar="PATTERN",
@@ -75,14 +75,14 @@ class ReplaySettings:
     vehicle: tuple[str, ...] = opt(
         "publish the messages of these trucks only, and no results",
         names,
-        group="messages",
+        group="selection",
         default=(),
         action="extend",
         metavar="ID",
     )
     rename: tuple[str, ...] = opt(
         "publish a truck under another name (the messages themselves stay as they are)",
-        group="messages",
+        group="selection",
         default=(),
         action="append",
         metavar="OLD=NEW",

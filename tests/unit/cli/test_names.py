@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 from services.cli import main as cli
+from services.cli.completion import commands_of
+from services.cli.main import whole_parser
 from services.common.files import is_unicode, replaced_atomically, write_atomically
 
 PROJECT = Path(__file__).parents[3]
@@ -138,3 +140,10 @@ def test_a_working_directory_that_is_gone_is_named(tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr == "driveby: the working directory is gone, change to one that exists\n"
+
+
+def test_help_has_no_two_groups_of_one_title() -> None:
+    """Two groups called messages had log options in one and topics in the other."""
+    for name, parser in commands_of(whole_parser()).items():
+        titles = [group.title for group in parser._action_groups]
+        assert len(titles) == len(set(titles)), name
