@@ -12,11 +12,12 @@ from schemas.proto import driveby_pb2 as pb
 from services.cli import main as cli
 from services.cli.alarm_service import AlarmPublisher
 from services.common.errors import InputError
+from services.common.language import language_of
 from services.history import alarms
 from services.history.alarm_files import acknowledge, alarms_of, standing_alarms
 from services.history.alarms import AlarmSettings, check, monitoring_states
 from services.history.history_store import add_results
-from services.history.watch_files import MonitoringState, record_path
+from services.history.watch_files import MonitoringState, WatchRecord, record_path
 from tests.fleet import WEEK_S, losses_of
 
 BEGIN_S = datetime(2025, 1, 6, tzinfo=UTC).timestamp()  # a Monday
@@ -387,3 +388,14 @@ def test_an_alarm_stands_though_its_crossings_are_gone(
     assert "active; element 4" in capsys.readouterr().out
     assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", *there]) == 0
     assert standing_alarms(history) == ([], [])
+
+
+def test_running_week_is_named_as_not_yet_complete() -> None:
+    """Good crossings of this week are there, so a sentence without this word is wrong."""
+    record = WatchRecord.model_construct(
+        period="week", judged=0, problem="", periods=0, training=8, at_least=0.05,
+        checked=0.0, until=0.0, year_ends=0.0, judged_from=0.0, judged_to=0.0,
+    )  # fmt: skip
+    state = MonitoringState("no_crossings", record)
+    assert "no complete week has good crossings" in state.sentence
+    assert "Kein vollständiger Zeitraum" in state.words(language_of("de"))
