@@ -88,7 +88,7 @@ def front_axle_response(problem: PosteriorProblem, y: FloatArray) -> FrontAxleRe
     return FrontAxleResponse(columns, by_model, apart_s, surface)
 
 
-def mismatch_power(
+def front_axle_power(
     problem: PosteriorProblem, response: FrontAxleResponse, some: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
     """Return two expected tapered periodograms (f,) of the axle's noise in mismatch residuals.

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.crossing import mismatch as _mismatch
-from pre_core.crossing.front_axle import FrontAxleResponse, mismatch_power
+from pre_core.crossing.front_axle import FrontAxleResponse, front_axle_power
 from pre_core.crossing.mismatch import BridgePavement, Mismatch, PeriodogramSegment
 from pre_core.crossing.noise import no_suspension_noise, noise_spectrum
 from pre_core.crossing.off_bridge import FEWEST_ROWS, rear_axle_chainage_m, rear_axle_samples_m
@@ -68,7 +68,7 @@ def estimate_pavement(
     part = _periodogram(problem, y, road, middle)
     known, shape = part.sensors, part.shapes[0]
     if front_axle is not None:
-        by_surface, by_model = mismatch_power(problem, front_axle, middle)
+        by_surface, by_model = front_axle_power(problem, front_axle, middle)
         known, shape = known + by_model, shape + by_surface
     length_m = middle.size * rows.every * rows.step_s * road.speed_m_per_s
     n = np.arange(1, part.seen.size + 1) / length_m

@@ -419,7 +419,7 @@ def test_power_of_the_front_axle_is_that_of_its_noise_in_the_mismatch() -> None:
     noise = (response.columns[0] @ weights.T)[some]
     nothing = np.zeros((1, 1))
     seen = [tapered_periodogram(one, nothing[0], nothing).seen for one in noise.T]
-    expected, by_model = front_axle.mismatch_power(problem, response, some)
+    expected, by_model = front_axle.front_axle_power(problem, response, some)
     clear = expected > 1e-3 * expected.max()
     assert np.mean(seen, axis=0)[clear] == pytest.approx(expected[clear], rel=0.3)
     assert not by_model.any()
