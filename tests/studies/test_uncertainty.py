@@ -9,6 +9,7 @@ import pytest
 
 from pre_core import parameters
 from schemas.settings import IdentificationSettings
+from services.simulation.drive import DrivenRoad, Measurement
 from studies.validation import uncertainty
 
 
@@ -28,8 +29,9 @@ def test_each_scenario_has_a_road_and_noise_of_its_own(monkeypatch: pytest.Monke
 
     seeds: list[int] = []
 
-    def simulate(*_: object, seed: int, **__: object) -> None:
-        seeds.append(seed)
+    def simulate(_: object, __: object, road: DrivenRoad, measured: Measurement) -> None:
+        assert measured.seed is None  # the road's
+        seeds.append(road.seed)
         raise DrawnError
 
     monkeypatch.setattr(uncertainty, "simulate_drive", simulate)

@@ -66,7 +66,9 @@ def test_each_message_once_with_what_was_before(
         for number in range(80, 100)  # a second of what the truck still has
     ]
     published = [one.payload for one in found if one.key.owner == "bridge"]
-    assert published == [before, alarm, now, last]
+    # Streams have an order each, and none among each other.
+    assert sorted(published[:2]) == sorted([before, alarm])
+    assert published[2:] == [now, last]
 
 
 def test_idle_subscriber_delays_no_process(router: zenoh.Session, publisher: Publisher) -> None:

@@ -131,6 +131,7 @@ def test_history_of_a_german_report_is_german(tmp_path: Path) -> None:
     assert next(text.get_text() for text in axes[3].texts) == "weniger steif"
 
 
+@pytest.mark.usefixtures("drawn")
 def test_axes_of_german_figures_have_a_decimal_comma(site: Site, tmp_path: Path) -> None:
     found = results_of(site, some_crossing("a"), some_crossing("b", entry=60.0), used="b")
     view = view_of_bridge(site.bridges[0], found, None)
