@@ -45,7 +45,7 @@ down: ## end the containers; recordings, results, spools and certificates stay i
 # On two cores: two workers compute while the third waits for processes (tests/groups.py).
 BESIDE := -n 3 --dist loadgroup
 
-test: $(STAMP) ## the default tests (some 8 minutes on 2 quiet cores)
+test: $(STAMP) ## the default tests (8 to 12 minutes on 2 cores)
 	$(BIN)/python -m pytest $(BESIDE)
 
 test-all: $(STAMP) ## the default tests and the slow ones
