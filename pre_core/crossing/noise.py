@@ -350,7 +350,7 @@ def mismatch_levels(
     omega, shapes = rows.omega, road.shapes
     table = np.concatenate([shapes.density, shapes.road[None, :]])
     shape = omega**4 * _mismatch.density_at(road, omega, table) * rows.power
-    longest_s = rows.every * rows.step_s * max(stretch.size for stretch in stretches)
+    longest_s = max(stretch.size for stretch in stretches) * rows.every * rows.step_s
     turn = phases(rows, min(_mismatch.correlation_time_s(road), longest_s))
     sensors = noise_spectrum(truck, density, no_suspension_noise(), None, omega)[0, 0].real
     of_sensors, of_shapes = ((sensors * rows.power) @ turn).real, (shape @ turn).real

@@ -70,7 +70,7 @@ def estimate_pavement(
     if front_axle is not None:
         by_surface, by_model = front_axle_power(problem, front_axle, middle)
         known, shape = known + by_model, shape + by_surface
-    length_m = middle.size * rows.every * rows.step_s * road.speed_m_per_s
+    length_m = middle.size * (rows.every * rows.step_s) * road.speed_m_per_s
     n = np.arange(1, part.seen.size + 1) / length_m
     low, high = _SHORT_CYCLES_PER_M
     short = (n > low) & (n < high)
@@ -86,7 +86,7 @@ def _periodogram(
     density = road.level_m3 @ _mismatch.density_at(road, omega, road.shapes.density)
     truck, sensor = noise_path_at(problem, y)
     of_sensors = noise_spectrum(truck, sensor, no_suspension_noise(), None, omega)[0, 0].real
-    memory = min(_mismatch.correlation_time_s(road), some.size * rows.every * rows.step_s)
+    memory = min(_mismatch.correlation_time_s(road), some.size * (rows.every * rows.step_s))
     turn = phases(rows, memory)
     return _mismatch.tapered_periodogram(
         filtered_rows(problem, y)[0, some],
