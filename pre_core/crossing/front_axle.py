@@ -56,10 +56,9 @@ class FrontAxleResponse(NamedTuple):
     """Residuals (3, m, K) in m for an acceleration of 1 m/s² at each knot."""
     by_model: FloatArray
     """Residuals (3, m, d) in m for a standard deviation of each value of the axle."""
-    apart_s: float
-    """Time between knots."""
-    surface_m2: float
-    """Phi k^3 of the surface."""
+    covariance: FloatArray
+    """Covariance (K, K) in m²/s^4 of the acceleration's error at the knots, where the surface under
+    the axle is as rough as off the bridge."""
 
 
 def front_axle_response(problem: PosteriorProblem, y: FloatArray) -> FrontAxleResponse | None:
@@ -78,18 +77,15 @@ def front_axle_response(problem: PosteriorProblem, y: FloatArray) -> FrontAxleRe
     for k in range(motions.shape[1]):
         moved = crossing._replace(lead_acceleration=crossing.lead_acceleration + motions[:, k])
         columns[:, :, k] = filtered_rows(problem._replace(crossing=moved), y) - base
-    by_model = np.empty((*base.shape, len(problem.displaced_leads)))
-    nominal = filtered_rows(with_lead_motion(problem, y), y)
-    for k, lead in enumerate(problem.displaced_leads):
-        other = with_lead_motion(problem._replace(crossing=crossing._replace(lead=lead)), y)
-        by_model[:, :, k] = filtered_rows(other, y) - nominal
+    by_model = _of_displaced_leads(problem, y, base.shape)
     if not (columns.size and np.isfinite(columns).all() and np.isfinite(by_model).all()):
         return None
-    return FrontAxleResponse(columns, by_model, apart_s, surface)
+    covariance = _covariance(problem, surface, apart_s, columns.shape[2])
+    return FrontAxleResponse(columns, by_model, covariance)
 
 
 def front_axle_power(
-    problem: PosteriorProblem, response: FrontAxleResponse, some: NDArray[np.int64]
+    response: FrontAxleResponse, some: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
     """Return two expected tapered periodograms (f,) of the axle's noise in mismatch residuals.
 
@@ -99,8 +95,9 @@ def front_axle_power(
     taper = hann_taper(some.size)[:, None]
     of_knots = np.fft.rfft(taper * response.columns[0, some], axis=0)[1:]
     of_values = np.fft.rfft(taper * response.by_model[0, some], axis=0)[1:]
-    covariance = _covariance(problem, response)
-    by_surface = np.einsum("fk,kl,fl->f", of_knots, covariance, of_knots.conj(), optimize=True)
+    by_surface = np.einsum(
+        "fk,kl,fl->f", of_knots, response.covariance, of_knots.conj(), optimize=True
+    )
     return by_surface.real, np.sum(np.abs(of_values) ** 2, axis=1)
 
 
@@ -117,7 +114,7 @@ def without_front_axle(
     noise = noise._replace(low_rank=np.zeros((0, 0)))
     if response is None:
         return noise
-    covariance = _covariance(problem, response)
+    covariance = response.covariance.copy()
     covariance[np.diag_indices_from(covariance)] *= 1.0 + _JITTER
     root = pavement_ratio(problem.mismatch) * cholesky(covariance, lower=True)
     forced = np.concatenate([response.columns @ root, response.by_model], axis=2)
@@ -155,16 +152,31 @@ def _unit_motions(problem: PosteriorProblem, y: FloatArray) -> tuple[FloatArray,
     return out, apart_s
 
 
-def _covariance(problem: PosteriorProblem, response: FrontAxleResponse) -> FloatArray:
-    """Return the covariance (K, K) in m²/s^4 of the acceleration's error at the knots.
+def _of_displaced_leads(
+    problem: PosteriorProblem, y: FloatArray, shape: tuple[int, ...]
+) -> FloatArray:
+    """Return the change (3, m, d) of the residuals (3, m) by each displaced front axle."""
+    out = np.empty((*shape, len(problem.displaced_leads)))
+    if not problem.displaced_leads:
+        return out
+    nominal = filtered_rows(with_lead_motion(problem, y), y)
+    for k, lead in enumerate(problem.displaced_leads):
+        moved = problem._replace(crossing=problem.crossing._replace(lead=lead))
+        out[:, :, k] = filtered_rows(with_lead_motion(moved, y), y) - nominal
+    return out
 
-    The surface under the axle is as rough as off the bridge.
+
+def _covariance(
+    problem: PosteriorProblem, surface: float, apart_s: float, count: int
+) -> FloatArray:
+    """Return the covariance (K, K) in m²/s^4 of the acceleration's error at `count` knots.
+
+    `surface` is Phi k^3 in m².
     """
-    count, apart_s = response.columns.shape[2], response.apart_s
     highest_hz = 0.5 / apart_s
     hz = highest_hz * (np.arange(_OVERSAMPLED * count) + 0.5) / (_OVERSAMPLED * count)
     turns = np.cos(2.0 * np.pi * np.outer(apart_s * np.arange(count), hz)) * (hz[1] - hz[0])
-    return np.asarray(toeplitz(turns @ _acceleration_power(problem, response.surface_m2, hz)))
+    return np.asarray(toeplitz(turns @ _acceleration_power(problem, surface, hz)))
 
 
 def _acceleration_power(problem: PosteriorProblem, surface: float, hz: FloatArray) -> FloatArray:

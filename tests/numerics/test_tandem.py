@@ -366,7 +366,7 @@ def test_noise_of_the_front_axle_is_white_once_whitened() -> None:
     still = with_known_front_axle(problem)
     response = front_axle.front_axle_response(still, y)
     assert response is not None
-    root = np.linalg.cholesky(front_axle._covariance(still, response))
+    root = np.linalg.cholesky(response.covariance)
     motions = front_axle._unit_motions(still, y)[0] @ root
     rng = np.random.default_rng(4)
     base = posterior.data_rows(still, y[None, :])[0]
@@ -414,12 +414,12 @@ def test_power_of_the_front_axle_is_that_of_its_noise_in_the_mismatch() -> None:
     before, behind = off_bridge_residuals(problem, y)
     some = np.arange(before.stop, behind.start)
     rng = np.random.default_rng(7)
-    covariance = front_axle._covariance(problem, response)
+    covariance = response.covariance
     weights = rng.multivariate_normal(np.zeros(len(covariance)), covariance, 400)
     noise = (response.columns[0] @ weights.T)[some]
     nothing = np.zeros((1, 1))
     seen = [tapered_periodogram(one, nothing[0], nothing).seen for one in noise.T]
-    expected, by_model = front_axle.front_axle_power(problem, response, some)
+    expected, by_model = front_axle.front_axle_power(response, some)
     clear = expected > 1e-3 * expected.max()
     assert np.mean(seen, axis=0)[clear] == pytest.approx(expected[clear], rel=0.3)
     assert not by_model.any()
