@@ -77,6 +77,11 @@ class BridgeHistory(NamedTuple):
     comparison: PeriodComparison | None = None
     """Comparison of two periods, for a bridge without monitoring."""
 
+    @property
+    def active_alarms(self) -> tuple[Alarm, ...]:
+        """Alarms without an acknowledgement."""
+        return tuple(alarm for alarm in self.alarms if alarm.acknowledged is None)
+
 
 class Statement(NamedTuple):
     """A sentence about whether a bridge has changed."""
@@ -111,9 +116,9 @@ def bridge_history(
 
 
 def statements(past: BridgeHistory, language: Language = ENGLISH) -> Iterator[Statement]:
-    """Yield the sentences for a bridge without a standing alarm."""
+    """Yield the sentences for a bridge without an active alarm."""
     watch = past.watch
-    if any(alarm.acknowledged is None for alarm in past.alarms):
+    if past.active_alarms:
         return
     yield Statement(watch.words(language), watch.found_nothing)
     if watch.found_nothing:

@@ -63,8 +63,8 @@ def advice_of_state(report: BridgeReport, language: Language) -> list[str]:
 
 def _alarms(report: BridgeReport, language: Language) -> Iterator[str]:
     """Yield the elements that an active alarm concerns."""
-    alarms = () if report.past is None else report.past.alarms
-    numbers = sorted({alarm.element for alarm in alarms if alarm.acknowledged is None})
+    alarms = () if report.past is None else report.past.active_alarms
+    numbers = sorted({alarm.element for alarm in alarms})
     if numbers:
         yield language.text("advice.alarm", elements=language.listed([str(n) for n in numbers]))
 

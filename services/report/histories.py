@@ -42,10 +42,9 @@ def with_history(report: BridgeReport, past: BridgeHistory, language: Language) 
     """Return a report with a history, whose alarms and changes its finding must not contradict."""
     report = report._replace(past=past)
     finding, cautions = report.finding, list(report.cautions)
-    standing = [alarm for alarm in past.alarms if alarm.acknowledged is None]
     change = change_over_time(past, language)
-    if standing:
-        alarms = "; ".join(alarm_sentence(alarm, language) for alarm in standing)
+    if past.active_alarms:
+        alarms = "; ".join(alarm_sentence(alarm, language) for alarm in past.active_alarms)
         headline = f"{finding.headline} {language.text('finding.alarm', alarms=alarms)}"
         kind = "open" if finding.kind == "sound" else finding.kind
         finding = finding._replace(kind=kind, headline=headline)

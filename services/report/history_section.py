@@ -15,9 +15,9 @@ from services.viewer.history_figure import HistoryView, draw_history, history_vi
 
 def history_summary(past: BridgeHistory, language: Language = ENGLISH) -> str:
     """Return number of crossings and state of alarms, for the first page."""
-    standing = sum(alarm.acknowledged is None for alarm in past.alarms)
-    alarms = language.choice("history.alarms", standing)
-    if not standing:
+    active = len(past.active_alarms)
+    alarms = language.choice("history.alarms", active)
+    if not active:
         which = "no_alarm" if past.watch.found_nothing else "not_watched"
         alarms = language.text(f"history.{which}")
     return language.text("history.summary", how_much=_how_much(past, language), alarms=alarms)
