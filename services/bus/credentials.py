@@ -137,6 +137,14 @@ def hosts_of(certificate: x509.Certificate) -> list[str]:
     ]
 
 
+def unlisted_hint(folder: Path) -> str:
+    """Return why a router may send nothing to the holder of a folder's credentials."""
+    return (
+        f"the router's list of participants lacks {check_credentials(folder)}, see "
+        "docs/security.md#changes"
+    )
+
+
 def link_settings(folder: Path | str) -> dict[str, Any]:
     """Return Zenoh's settings for mutual TLS, and TLS only, with a folder's credentials.
 

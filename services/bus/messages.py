@@ -12,7 +12,7 @@ from google.protobuf.message import Message
 from schemas.messages import decode
 from schemas.topics import PREFIX, Key, topic
 from services.bus.access_control import read_by
-from services.bus.credentials import check_credentials
+from services.bus.credentials import check_credentials, unlisted_hint
 from services.bus.session import open_session
 from services.bus.subscription import RawSample, Subscription
 from services.common.errors import InputError
@@ -86,7 +86,4 @@ def _why_silent(endpoint: str, key_expression: str, tls: Path | None) -> str:
     nothing = f"nothing received for {_SILENCE_S:g} s on {key_expression} at {endpoint}"
     if tls is None:
         return f"{nothing}: nothing is published there"
-    return (
-        f"{nothing}: nothing is published there, or the router's list of participants lacks "
-        f"{check_credentials(tls)}, see docs/security.md#changes"
-    )
+    return f"{nothing}: nothing is published there, or {unlisted_hint(tls)}"

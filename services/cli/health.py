@@ -11,7 +11,7 @@ from pathlib import Path
 from schemas.messages import decode
 from schemas.proto import driveby_pb2 as pb
 from schemas.topics import check_identifier, check_realm, key
-from services.bus.credentials import check_credentials
+from services.bus.credentials import unlisted_hint
 from services.bus.session import open_session
 from services.bus.subscription import Subscription
 from services.common.errors import FailureError, InputError
@@ -42,9 +42,10 @@ def health_command(
     ):
         latest = _latest(subscription, patience_s)
     if latest is None:
+        or_unlisted = "" if tls is None else f"; or {unlisted_hint(tls)}"
         raise FailureError(
             f"{service} in realm {realm} sends nothing at {endpoint}; --realm NAME asks another (a "
-            f"logger of several realms or a pattern: live){_or_unlisted(tls)}"
+            f"logger of several realms or a pattern: live){or_unlisted}"
         )
     age_s = time.time() - latest.time_ns * 1e-9
     if age_s > OLDEST_S:
@@ -57,14 +58,6 @@ def health_command(
     if age_s < -_AHEAD_S:
         notes.append(f"its clock is {-age_s:.0f} s ahead of this machine's")
     return "; ".join([f"{service} in realm {realm} is well, {max(age_s, 0.0):.0f} s ago", *notes])
-
-
-def _or_unlisted(tls: Path | None) -> str:
-    """Return the further reason for silence that credentials have."""
-    if tls is None:
-        return ""
-    subject = check_credentials(tls)
-    return f"; or the router's list of participants lacks {subject}, see docs/security.md#changes"
 
 
 def _latest(subscription: Subscription, patience_s: float) -> pb.Health | None:
