@@ -8,7 +8,7 @@ later ones.
 
 from bisect import insort
 from collections.abc import Collection, Iterator, Mapping
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -18,6 +18,7 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.signals import MAX_BATCH_S, MAX_CHANNELS, NS_PER_S, AccelBatch, GnssFix, in_order
 
 Floats = NDArray[np.float64]
+TruckMessage = TypeVar("TruckMessage", bound=pb.AccelBatch | pb.GnssFix | pb.VehicleInfo)
 
 PATIENCE_S = 10.0
 """Time in s to wait for a missing message after newer data arrived; then it counts as lost."""
@@ -266,12 +267,7 @@ def device_time_ns(stream: str, payload: bytes) -> int:
         "gnss": pb.GnssFix,
         "info": pb.VehicleInfo,
     }
-    message = kinds[stream]()
-    try:
-        message.ParseFromString(payload)
-    except DecodeError as error:
-        raise ValueError(f"not a {message.DESCRIPTOR.full_name}: {error}") from None
-    return message.device_time_ns
+    return _parsed(kinds[stream](), payload).device_time_ns
 
 
 class BatchExtent(NamedTuple):
@@ -284,16 +280,20 @@ class BatchExtent(NamedTuple):
 
 def batch_extent(payload: bytes) -> BatchExtent:
     """Return the extent of an `accel` message; ValueError if it is malformed or has no samples."""
-    message = pb.AccelBatch()
-    try:
-        message.ParseFromString(payload)
-    except DecodeError as error:
-        raise ValueError(f"not an AccelBatch: {error}") from None
+    message = _parsed(pb.AccelBatch(), payload)
     channels = [(one.rate_hz, len(one.acceleration_m_per_s2)) for one in message.channels]
     rate_hz, samples = max(channels, default=(0.0, 0))
     if not (0.0 < rate_hz < np.inf and samples):
         raise ValueError("an AccelBatch without samples")
     return BatchExtent(message.device_time_ns, rate_hz, samples)
+
+
+def _parsed(message: TruckMessage, payload: bytes) -> TruckMessage:
+    try:
+        message.ParseFromString(payload)
+    except DecodeError as error:
+        raise ValueError(f"not a {message.DESCRIPTOR.full_name}: {error}") from None
+    return message
 
 
 def missing_samples(

@@ -285,11 +285,11 @@ def _entry(passing: "DetectedCrossing") -> int:
 
 def _is_same(earlier: "DetectedCrossing", later: "DetectedCrossing") -> bool:
     """Return whether two recordings hold the same crossing, or the later one its rest."""
-    from services.finding.stays import are_one
+    from services.finding.stays import Passage, are_one
 
     return are_one(earlier.entry_ns, earlier.exit_ns, later.entry_ns, later.exit_ns) or (
-        earlier.passage.value == "ends on the bridge"
-        and later.passage.value == "begins on the bridge"
+        earlier.passage is Passage.ENDS_ON_BRIDGE
+        and later.passage is Passage.BEGINS_ON_BRIDGE
         and later.entry_ns - earlier.exit_ns < _NEXT_FILE_NS
     )
 
