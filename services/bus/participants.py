@@ -14,7 +14,7 @@ from schemas.topics import Key, key, selector
 from services.bus.publisher import is_matched
 
 _EVENTS_WAITING = 1_000
-"""Queue length for links, more than connect between two looks."""
+"""Queue length for links, more than connect between two calls."""
 
 
 class UnlistedParticipants:
@@ -30,19 +30,19 @@ class UnlistedParticipants:
 
     def arrivals(self) -> list[str]:
         """Return the unlisted common names that have connected since the last call."""
-        come: dict[str, None] = {}
+        arrived: dict[str, None] = {}
         while (event := self._events.try_recv()) is not None:
             name = event.link.auth_identifier
             if name is None or name in self._listed:
                 continue
             if event.kind == zenoh.SampleKind.PUT:
                 self._links[name] += 1
-                come[name] = None
+                arrived[name] = None
             elif self._links[name] > 1:
                 self._links[name] -= 1
             else:
                 del self._links[name]
-        return list(come)
+        return list(arrived)
 
     @property
     def connected(self) -> list[str]:

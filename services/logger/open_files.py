@@ -72,7 +72,7 @@ class OpenFiles:
         """Messages that were in files which are gone, and may come again."""
         self.unwritten: deque[Identities] = deque()
         """Messages for which there was no file: they may come again."""
-        self.said: deque[Message] = deque()
+        self.unpublished: deque[Message] = deque()
         """Events that were written here and that are to be published."""
         self.drops = Drops(place.realm or "live")
         self.durable = DurableStreams()
@@ -161,7 +161,7 @@ class OpenFiles:
         realms = {realm for realm, _ in self._files if realm} or {self._place.realm or "live"}
         for realm in sorted(realms):
             message = self._own.message(realm, event)
-            self.said.append(message)
+            self.unpublished.append(message)
             self.write(message, time.monotonic())
 
     def finish(self, reason: str, counts: Mapping[str, int]) -> None:
@@ -175,7 +175,7 @@ class OpenFiles:
         lost: list[Message] = []
         for name, opened in self._files.items():
             message = self._own.message(name[0] or self._place.realm or "live", event)
-            self.said.append(message)
+            self.unpublished.append(message)
             mine = [m for n, m in self._unsynced if n == name]
             counts = {"dropped": self.drops.of(*name) - opened.dropped_before}
             at_fault = name == failed
@@ -282,6 +282,6 @@ class OpenFiles:
             EventKind.RECORDING_GONE, time.time_ns(), text, vehicle=vehicle, messages=number
         )
         _log.error("%s: %s", event.kind, text)
-        said = self._own.message(name[0] or self._place.realm or "live", event)
-        self.said.append(said)
-        self.write(said, time.monotonic())
+        message = self._own.message(name[0] or self._place.realm or "live", event)
+        self.unpublished.append(message)
+        self.write(message, time.monotonic())

@@ -322,7 +322,7 @@ class _Announcements:
             closing = self._closing.wait(_ANNOUNCE_PERIOD_S)
             self._publish_events()
             self._complaints.flush()
-            self._unlisted.look()
+            self._unlisted.log_arrivals()
             is_due = closing or time.monotonic() >= next_durable_s
             if is_due and self._logger.writer.durable_version() != version:
                 next_durable_s = time.monotonic() + _DURABLE_PERIOD_S
@@ -343,8 +343,8 @@ class _Announcements:
     def _publish_events(self) -> None:
         with self._lock:
             pending, self._pending = self._pending, []
-        while self._logger.writer.said:
-            pending.append(self._logger.writer.said.popleft())
+        while self._logger.writer.unpublished:
+            pending.append(self._logger.writer.unpublished.popleft())
         for message in pending:
             _, owner, name, stream = message.key
             identity = Identity(message.boot_id, message.sequence)

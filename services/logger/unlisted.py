@@ -28,7 +28,7 @@ class UnlistedLog:
         self._logged_s: dict[str, float] = {}
         self._watch = None if tls is None else UnlistedParticipants(bus, listed_participants(tls))
 
-    def look(self) -> None:
+    def log_arrivals(self) -> None:
         """Log a line for each unlisted certificate that has connected since the last call."""
         if self._watch is None or self._tls is None:
             return

@@ -52,7 +52,7 @@ class FileWriter:
         """Messages that were in files which are gone, and may come again; the caller empties it."""
         self.unwritten = self._files.unwritten
         """Messages for which there was no file: they may come again. The caller empties it."""
-        self.said = self._files.said
+        self.unpublished = self._files.unpublished
         """Events that this thread has written down itself and that are to be published."""
         self.limits = limits
         self.room = DiskRoom(place.top, limits.min_free_bytes, disk)

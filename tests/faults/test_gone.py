@@ -79,7 +79,7 @@ def test_what_was_in_a_file_that_is_gone_is_not_called_durable(
     wait_for(lambda: writer.written == 101)
     [path] = folder.glob("live/*/*.mcap")
     harm(path)
-    wait_for(lambda: writer.said)
+    wait_for(lambda: writer.unpublished)
     for sequence in range(100, 150):
         writer.put(fix(sequence))
     wait_for(lambda: (found := durable()) and found.count in (50, 150))
@@ -87,7 +87,7 @@ def test_what_was_in_a_file_that_is_gone_is_not_called_durable(
     writer.finish("done", {})
     assert writer.failure is None
     assert found is not None
-    [published] = [decode_event(message.payload) for message in writer.said]
+    [published] = [decode_event(message.payload) for message in writer.unpublished]
     assert published.kind == EventKind.RECORDING_GONE
     ours = [p for p in folder.glob("live/*/*.mcap") if p.read_bytes()[:5] == b"\x89MCAP"]
     if harm is move:
