@@ -250,7 +250,7 @@ def test_disk_full_at_any_byte_is_reported_and_counted(
         mine = [m.sequence for m in found if m.key.identifier == stream.identifier]
         assert mine == list(range(stream.count))
         assert stream.sequence == stream.count - 1
-    assert [m for m in writer.said if m.key.stream == "event"]
+    assert [m for m in writer.unpublished if m.key.stream == "event"]
     for path in tmp_path.glob("live/*/*.mcap"):
         if is_closed(path):
             end = read_info(path).end
@@ -343,7 +343,7 @@ def test_low_space_is_reported_and_ends_recording_early(
     wait_for(lambda: writer.written == 10)
     assert not writer.room.is_low
     room = 700_000
-    wait_for(lambda: writer.said)
+    wait_for(lambda: writer.unpublished)
     assert writer.room.is_low
     for message in sent[10:]:
         writer.put(message)
