@@ -10,7 +10,6 @@ import pytest
 from hypothesis import settings
 
 from services.security.settings import CertsSettings
-from services.simulation.drive import DrivenRoad
 from tests.endpoints import free_endpoint
 
 if TYPE_CHECKING:
@@ -97,6 +96,6 @@ def csv_example() -> Path:
 def scenario_6() -> "SimulatedDrive":
     """A crossing of the paper's scenario 6: fine mesh of 70 elements, 0.1 ms, no noise."""
     from pre_core.paper.experiment import scenario_ratios
-    from services.simulation.drive import paper_site, simulate_drive
+    from services.simulation.drive import DrivenRoad, paper_site, simulate_drive
 
     return simulate_drive(paper_site(), scenario_ratios(6), DrivenRoad("A", 1))

@@ -1,5 +1,7 @@
 """Whoever calls us from a notebook has not set OPENBLAS_NUM_THREADS, and need not."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -25,3 +27,12 @@ def test_an_identification_computes_with_one_thread_of_blas(project: Path) -> No
         assert set(inside) == {1}
         # numpy and scipy bring one each, and both have what they had.
         assert set(blas_threads()) == set(before) == {2}
+
+
+def test_tests_compute_with_one_thread_of_blas_as_the_commands_do(project: Path) -> None:
+    """A module that imports numpy at the top of conftest.py would come before the limit."""
+    code = "import sys, tests.conftest; print('numpy' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=project
+    )
+    assert done.stdout == "False\n"
