@@ -26,6 +26,7 @@ from services.simulation.drive import (
 )
 from services.simulation.drive_tandem import TandemDrive, simulate_tandem
 from services.simulation.lane import driven_lane, twist_of
+from services.simulation.pair import with_pair_first
 from services.simulation.pavement import Pavement
 from services.simulation.schedule import Schedule, schedule_of
 from services.simulation.settings import SimulateOptions
@@ -48,6 +49,7 @@ def simulate_command(asked: SimulateOptions, console: "Console") -> int:
     InputError: a bad site file, options that exclude each other, or a file that is not writable.
     """
     known = paper_site() if asked.site is None else load_site(asked.site)
+    known = with_pair_first(known, asked.vehicle, asked.bridge)
     tandem = _with_tandem(asked, known)
     if tandem is not None:
         return _simulate_tandem(asked, tandem, console)

@@ -55,6 +55,12 @@ class SimulateOptions:
         metavar="1,1,.4,…",
     )
     site: Path | None = site_option("site file (default: truck and bridge of the paper)")
+    vehicle: str | None = opt(
+        "identifier of the site's vehicle that drives (default: its first)", metavar="ID"
+    )
+    bridge: str | None = opt(
+        "identifier of the site's bridge that it crosses (default: its first)", metavar="ID"
+    )
     axles: int | None = opt(
         "axles of the truck; 3: a loaded tipper with an equalised tandem, unless the site's "
         "truck has one (default: the site's truck, or 2)",
