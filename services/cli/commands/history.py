@@ -35,8 +35,8 @@ class HistoryOptions:
     """Results to add, or a bridge to show."""
 
     words: tuple[str, ...] = positional(
-        "bridge to show; or add, followed by results files or folders of identify --into; if "
-        "omitted, a table of all bridges",
+        "bridge to show; or add, followed by results files or folders of identify --into or a worker; "
+        "if omitted, a table of all bridges",
         nargs="*",
         metavar="BRIDGE | add RESULTS …",
     )
@@ -92,17 +92,21 @@ def _add(options: HistoryOptions, paths: list[Path]) -> int:
 
 
 def _results_of(path: Path, problem: Callable[[str], object]) -> "Iterable[Results]":
-    """Yield the results of a file, or a folder of `identify --into`; InputError for others."""
+    """Yield the results of a file, or a folder of `identify --into` or workers; else InputError."""
     from schemas.results import load_results
     from services.execution.result_store import files_of, kept_results
+    from services.ledger.worker_results import files_of_workers, results_of_workers
 
     if not path.is_dir():
         return (load_results(path),)
-    if not files_of(path):
-        raise InputError(
-            f"{path}: has no results, HASH.parquet of driveby identify --into are expected"
-        )
-    return kept_results(path, problem)
+    if files_of(path):
+        return kept_results(path, problem)
+    if files_of_workers(path):
+        return results_of_workers(path, problem)
+    raise InputError(
+        f"{path}: has no results, HASH.parquet of driveby identify --into or results-TIME.json of "
+        "driveby worker (in FOLDER/REALM) are expected"
+    )
 
 
 def _add_one(

@@ -126,3 +126,30 @@ def test_a_folder_without_results_is_one_line(
     assert said.count("\n") == 1
     assert f"{tmp_path}: has no results, HASH.parquet of driveby identify --into" in said
     assert not (tmp_path / "history").exists()
+
+
+def test_folder_of_workers_is_added(
+    tmp_path: Path, found: list[CrossingResult], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "recordings" / "live"
+    (folder / "2026-08-27").mkdir(parents=True)
+    for number, some in enumerate((found[:1], found[1:])):
+        path = folder / f"results-20260827T10000{number}Z.json"
+        path.write_text(results_json(results(HEADER, some, {})))
+    assert add(folder, tmp_path) == 0
+    torn = folder / "results-20260827T110000Z.json"
+    torn.write_text("{")
+    assert add(folder, tmp_path) == EXIT_SOMETHING_LOST
+    first, again, line = capsys.readouterr().out.splitlines()
+    assert first == f"{folder}: 4 crossings of bridge-1 added"
+    assert again == f"{folder}: 0 crossings added, 4 there already"
+    assert line.startswith(f"{torn}: ")
+
+
+def test_folder_without_results_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert add(tmp_path, tmp_path) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "results-TIME.json of driveby worker (in FOLDER/REALM) are expected" in error
