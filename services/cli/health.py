@@ -5,12 +5,15 @@ session keeps for later subscribers. It requires a router that answers, certific
 accepts, and a service that connects, is admitted and has not stopped.
 """
 
+import contextlib
 import time
 from pathlib import Path
 
+import zenoh
+
 from schemas.messages import decode
 from schemas.proto import driveby_pb2 as pb
-from schemas.topics import check_identifier, check_realm, key
+from schemas.topics import PREFIX, check_identifier, check_realm, key
 from services.bus.credentials import unlisted_hint
 from services.bus.session import open_session
 from services.bus.subscription import Subscription
@@ -22,6 +25,9 @@ _AHEAD_S = 2.0
 """Time in s by which a message lies in the future when a clock is wrong."""
 _ANSWER_S = 5.0
 """Longest wait for the answer in s; a healthy service answers from memory."""
+_ELSEWHERE_S = 1.0
+"""Duration in s of the search for a silent service in other realms."""
+_MAX_REALMS = 3
 
 
 def health_command(
@@ -41,12 +47,17 @@ def health_command(
         Subscription(session, where) as subscription,
     ):
         latest = _latest(subscription, patience_s)
+        elsewhere = _realms_of(session, service) if latest is None else []
     if latest is None:
-        or_unlisted = "" if tls is None else f"; or {unlisted_hint(tls)}"
-        raise FailureError(
-            f"{service} in realm {realm} sends nothing at {endpoint}; --realm NAME asks another (a "
-            f"logger of several realms or a pattern: live){or_unlisted}"
-        )
+        if elsewhere:
+            hint = f"it answers with --realm {' or '.join(elsewhere)}"
+        else:
+            or_unlisted = "" if tls is None else f"; or {unlisted_hint(tls)}"
+            hint = (
+                "--realm NAME asks another (a logger of several realms or a pattern: live)"
+                f"{or_unlisted}"
+            )
+        raise FailureError(f"{service} in realm {realm} sends nothing at {endpoint}; {hint}")
     age_s = time.time() - latest.time_ns * 1e-9
     if age_s > OLDEST_S:
         raise FailureError(f"{service} in realm {realm} has sent nothing for {age_s:.0f} s")
@@ -58,6 +69,19 @@ def health_command(
     if age_s < -_AHEAD_S:
         notes.append(f"its clock is {-age_s:.0f} s ahead of this machine's")
     return "; ".join([f"{service} in realm {realm} is well, {max(age_s, 0.0):.0f} s ago", *notes])
+
+
+def _realms_of(session: zenoh.Session, service: str) -> list[str]:
+    """Return the realms in which a service of this name answers, at most `_MAX_REALMS`."""
+    found: set[str] = set()
+    with Subscription(session, f"{PREFIX}/*/service/{service}/health") as subscription:
+        deadline_s = time.monotonic() + _ELSEWHERE_S
+        while (left_s := deadline_s - time.monotonic()) > 0 and len(found) < _MAX_REALMS:
+            received = subscription.receive(left_s)
+            if received is not None:
+                with contextlib.suppress(ValueError):  # not one of our keys
+                    found.add(received.key().realm)
+    return sorted(found)
 
 
 def _latest(subscription: Subscription, patience_s: float) -> pb.Health | None:

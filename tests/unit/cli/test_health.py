@@ -44,3 +44,19 @@ def test_clock_of_a_service_that_is_ahead_is_reported(endpoint: str) -> None:
     assert start == "logger in realm live is well, 0 s ago; disk"
     assert clock.startswith("its clock is 3")
     assert clock.endswith(" s ahead of this machine's")
+
+
+def test_silent_service_is_found_in_its_own_realm(endpoint: str) -> None:
+    """A logger of several realms, or of a pattern, publishes its health in realm live."""
+    with open_session(listen=endpoint) as session:
+        publisher = Publisher(session, "live")
+        sent = pb.Health(schema_version=1, service="logger", ok=True, time_ns=time.time_ns())
+        publisher.put("service", "logger", "health", sent.SerializeToString())
+        with pytest.raises(FailureError) as caught:
+            health_command(
+                service="logger", endpoint=endpoint, tls=None, realm="sim-two", patience_s=0.5
+            )
+        publisher.close()
+    assert str(caught.value) == (
+        f"logger in realm sim-two sends nothing at {endpoint}; it answers with --realm live"
+    )
