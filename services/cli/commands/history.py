@@ -35,8 +35,8 @@ class HistoryOptions:
     """Results to add, or a bridge to show."""
 
     words: tuple[str, ...] = positional(
-        "bridge to show; or add, followed by results files or folders of identify --into or a worker; "
-        "if omitted, a table of all bridges",
+        "bridge to show; or add, followed by results files or folders of identify --into or a "
+        "worker; if omitted, a table of all bridges",
         nargs="*",
         metavar="BRIDGE | add RESULTS …",
     )
