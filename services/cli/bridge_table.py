@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from schemas.reasons import LEFT_OUT_TEXTS, BridgeReason
 from schemas.results import BridgeResult, ElementState, Parameter, Thirds, ThirdsState
+from services.common.naming import count_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -39,7 +40,7 @@ def print_bridge(console: "Console", bridge: BridgeElements, state: BridgeResult
     """Print the fused state of a bridge: first the quality of the measurement, then the bridge."""
     used, left = len(state.crossings_used), state.crossings_left_out_count
     console.print(
-        f"[bold]{bridge.id}[/], {used} crossing{'' if used == 1 else 's'} together"
+        f"[bold]{bridge.id}[/], {count_of(used, 'crossing')} together"
         + (f", {left} excluded" if left else ""),
         highlight=False,
     )

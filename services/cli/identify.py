@@ -30,6 +30,7 @@ from services.common.files import (
     replaced_atomically,
     write_atomically,
 )
+from services.common.naming import count_of
 from services.common.options import CERTIFICATES
 from services.common.progress import parts_bar, reading_bar, steps_bar
 from services.execution.dispatch import CrossingExecutor
@@ -80,7 +81,7 @@ def identify_command(
 
         with steps_bar(f"drawing into {asked.figures}", console) as drawn:
             written = write_pictures(asked.figures, found, known, drawn, request.fusing.baselines)
-        line = f"{len(written)} pictures in {asked.figures}"
+        line = f"{count_of(len(written), 'picture')} in {asked.figures}"
         console.print(line, highlight=False, soft_wrap=True)
     if asked.draws is not None:
         kept = (

@@ -18,6 +18,7 @@ from services.cli.parsing import EXIT_SOMETHING_LOST
 from services.cli.settings import IdentifyOptions
 from services.common.errors import InputError
 from services.common.files import check_writable, make_folder, write_atomically
+from services.common.naming import count_of
 from services.common.options import CERTIFICATES
 from services.common.progress import progress_bar
 from services.common.stores import Folder, files_below, folder_at
@@ -93,7 +94,7 @@ def archive_command(
             InlineExecutor() if execution is None else execution,
             kept,
             on_result=crossings.append if json_path is not None else lambda crossing: None,
-            report=lambda number: bar.update(task, description=f"{number} crossings"),
+            report=lambda number: bar.update(task, description=count_of(number, "crossing")),
         )
     header = asked.header
     _write(into / BRIDGES, header, [], found)
@@ -165,7 +166,7 @@ def _print_summary(
 
     for number, (name, state) in enumerate(found.bridges.items()):
         if number == _MAX_BRIDGES:
-            say(f"… and {len(found.bridges) - number} bridges more")
+            say(f"… and {count_of(len(found.bridges) - number, 'more bridge')}")
             break
         print_bridge(console, site.bridge(name), state)
         console.print()

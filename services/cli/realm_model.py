@@ -22,6 +22,7 @@ from schemas.results_on_the_wire import estimate_to_crossing, state_to_bridge
 from schemas.signals import decode_accel, decode_gnss
 from services.bus.realm_listener import BusMessage
 from services.common.errors import one_line
+from services.common.naming import count_of
 from services.identification.comparison import Comparison, compare, estimate_of_state
 from services.viewer.crossing_view import (
     ResultElements,
@@ -244,8 +245,9 @@ class RealmModel:
         if self.bridges.get(bridge) == row:
             return None
         self.bridges[bridge] = row
-        crossings = f"{used} crossing{'' if used == 1 else 's'}"
-        return f"{bridge} by {crossings}: {row.finding or row.lowest or row.verdict}"
+        return (
+            f"{bridge} by {count_of(used, 'crossing')}: {row.finding or row.lowest or row.verdict}"
+        )
 
     def _take_alarm(self, alarm: Alarm) -> str | None:
         before = self.alarms.get(alarm.bridge)

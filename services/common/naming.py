@@ -1,4 +1,4 @@
-"""Names that users and files give, as identifiers of keys."""
+"""Names that users and files give, as identifiers of keys, and counted nouns."""
 
 import re
 
@@ -17,3 +17,8 @@ def checked_identifier(text: str, option: str) -> str:
         return check_identifier(text)
     except ValueError as error:
         raise InputError(f"{option}: {error}") from error
+
+
+def count_of(number: float, noun: str) -> str:
+    """Return a whole number with its noun in the right number: `1 truck`, `0 trucks`."""
+    return f"{number:.0f} {noun}{'' if number == 1 else 's'}"

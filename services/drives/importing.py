@@ -11,7 +11,7 @@ from schemas.site_file import load_site, parse_site, read_site_text
 from schemas.topics import Message
 from services.common.errors import InputError
 from services.common.files import check_writable
-from services.common.naming import checked_identifier
+from services.common.naming import checked_identifier, count_of
 from services.common.progress import Steps, no_step_progress
 from services.drives.comma2k19 import is_comma2k19, read_comma2k19
 from services.drives.csv_runs import (
@@ -74,11 +74,10 @@ def import_command(
         drive,
         force=asked.force,
     )
-    drives = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
     seconds = sum(float(run.accel_time_s[-1] - run.accel_time_s[0]) for run in runs)
     return (
-        f"{output}: {drives} of {vehicle_id}, {seconds:.1f} s, {messages} messages, "
-        f"realm {drive.realm}"
+        f"{output}: {count_of(len(runs), 'run')} of {vehicle_id}, {seconds:.1f} s, "
+        f"{messages} messages, realm {drive.realm}"
     )
 
 

@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 
 from schemas.signals import NS_PER_S
+from services.common.naming import count_of
 from services.logger.clocks import STEP_NS
 
 _MAX_NAMED = 3
@@ -18,12 +19,12 @@ def health_line(figures: Mapping[str, float]) -> str:
     if known["lag_s"] > _LONG_LAG_S:
         why = " (samples so old when they came: played faster than real, sent late, or a clock off)"
     return (
-        f"{known['trucks_alive']:.0f} trucks, {known['rate_per_s']:.0f} messages/s, "
+        f"{count_of(known['trucks_alive'], 'truck')}, {known['rate_per_s']:.0f} messages/s, "
         f"lag {known['lag_s']:.2f} s{why}, queue {known['queue']:.0f}, lost {known['lost']:.0f}, "
         f"missing {known['missing']:.0f}, recovered {known['recovered']:.0f}, "
         f"duplicates {known['duplicates']:.0f}, refused {known['refused']:.0f}, "
         f"dropped {known['dropped']:.0f}, written {known['written']:.0f} to "
-        f"{known['files']:.0f} files, {known['disk_free_bytes'] / 1e9:.1f} GB left"
+        f"{count_of(known['files'], 'file')}, {known['disk_free_bytes'] / 1e9:.1f} GB left"
     )
 
 

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from pre_core.survey.detection import DETECTION_PROBABILITY
+from services.common.naming import count_of
 from services.identification.checks import SHORTEST_APPROACH_M
 from services.identification.identify import SLOWEST_M_PER_S
 from services.inspection.finding import CheckStatus
@@ -68,7 +69,7 @@ def _of_the_plan(found: SurveyForecast) -> str:
             f"detect a loss of {percent(smallest)} or more, and give the overall stiffness to "
             f"± {percent(planned.expected.level_std)}."
         )
-    count = _crossings(planned.needed_middle)
+    count = count_of(planned.needed_middle, "crossing")
     verb = "detects" if planned.needed_middle == 1 else "detect"
     return f"{count} {how} {verb} {what}; {_ends(planned)}."
 
@@ -102,7 +103,7 @@ def _of_the_others(found: SurveyForecast) -> str:
         gain = f"then {found.question.crossings} detect a loss of {percent(smallest)}"
     else:
         verb = "detects" if best.needed_middle == 1 else "detect"
-        gain = f"then {_crossings(best.needed_middle)} {verb} it, and {_ends(best)}"
+        gain = f"then {count_of(best.needed_middle, 'crossing')} {verb} it, and {_ends(best)}"
     sentence = f"What helps most: {best.plan.label}; {gain}."
     if len(better) > 1:
         next_best = better[1]
@@ -121,10 +122,6 @@ def _helps(one: PlanForecast, planned: PlanForecast) -> bool:
 
 def _rank(one: PlanForecast) -> float:
     return float(one.expected.smallest_loss[one.middle])
-
-
-def _crossings(count: int) -> str:
-    return "1 crossing" if count == 1 else f"{count} crossings"
 
 
 def warnings(found: SurveyForecast) -> Iterator[str]:

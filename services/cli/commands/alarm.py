@@ -9,6 +9,7 @@ from services.cli.alarm_line import alarm_line
 from services.cli.parser import Subcommand
 from services.common.endpoints import default_endpoint
 from services.common.errors import InputError
+from services.common.naming import count_of
 from services.common.options import (
     endpoint_option,
     flag,
@@ -92,9 +93,8 @@ def _alarm(options: AlarmOptions) -> int:
     if what == "serve":
         return _serve(options)
     checked = _checked(options)
-    many = "bridges" if checked.bridges != 1 else "bridge"
-    alarms = "alarms" if len(checked.raised) != 1 else "alarm"
-    print(f"{checked.bridges} {many} checked, {len(checked.raised)} new {alarms}")
+    checks, alarms = count_of(checked.bridges, "bridge"), count_of(len(checked.raised), "new alarm")
+    print(f"{checks} checked, {alarms}")
     for alarm in checked.standing:
         print(alarm_line(alarm))
     _print_watches(options.history)
@@ -158,11 +158,17 @@ def _print_watches(folder: Path) -> None:
     if not found:
         return
     others = {name: one for name, one in found.items() if one.state not in ("watched", "alarm")}
-    print(f"{len(found) - len(others)} of {len(found)} bridges monitored")
+    print(_how_many_monitored(len(found) - len(others), len(found)))
     for realm, bridge in list(others)[:_MAX_LINES]:
         print(f"{bridge} in realm {realm}: {others[(realm, bridge)].sentence}")
     if len(others) > _MAX_LINES:
         print(f"and {len(others) - _MAX_LINES} more that are not monitored")
+
+
+def _how_many_monitored(monitored: int, bridges: int) -> str:
+    if bridges == 1:
+        return "the only bridge is monitored" if monitored else "the only bridge is not monitored"
+    return f"{monitored} of {bridges} bridges monitored"
 
 
 def _acknowledge(options: AlarmOptions, bridge: str) -> int:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from services.cli.parser import Subcommand
 from services.common.kinds import CATALOG_CSV, CROSSINGS_CSV
+from services.common.naming import count_of
 from services.common.options import flag, output_option, positional, site_option
 
 if TYPE_CHECKING:
@@ -70,16 +71,15 @@ def _summary(rows: "list[CatalogRow]", added: int) -> str:
     vehicles = {vehicle for row in rows for vehicle in row.vehicles}
     size = sum(row.size_bytes for row in rows)
     gaps = sum(row.gaps for row in rows)
-    said = (
-        f"{len(rows)} recording{'s' if len(rows) != 1 else ''} ({added} new to the catalogue), "
-        f"{len(vehicles)} truck{'s' if len(vehicles) != 1 else ''}, {size / 1e6:.1f} MB, "
-        f"{gaps} gap{'s' if gaps != 1 else ''}"
+    summary = (
+        f"{count_of(len(rows), 'recording')} ({added} new to the catalogue), "
+        f"{count_of(len(vehicles), 'truck')}, {size / 1e6:.1f} MB, {count_of(gaps, 'gap')}"
     )
     measured = [row for row in rows if row.vehicles]  # recordings of results have none
     if measured:
         begin, end = min(row.first_ns for row in measured), max(row.last_ns for row in measured)
-        said += f", {_time(begin)} to {_time(end)}"
-    return said
+        summary += f", {_time(begin)} to {_time(end)}"
+    return summary
 
 
 def _table_of_rows(rows: "list[CatalogRow]") -> Iterator[tuple[object, ...]]:
@@ -126,11 +126,9 @@ def _print_crossings(found: "CatalogScan") -> None:
         )
     if len(found.crossings) > _MAX_LINES:
         print(f"… and {len(found.crossings) - _MAX_LINES} more (--csv has all)")
-    number = len(found.crossings)
     print(
-        f"{number} crossing{'s' if number != 1 else ''}; read {found.chunks_read} of "
-        f"{found.chunks} chunks of {found.files_read} recording"
-        f"{'s' if found.files_read != 1 else ''}"
+        f"{count_of(len(found.crossings), 'crossing')}; read {found.chunks_read} of "
+        f"{found.chunks} chunks of {count_of(found.files_read, 'recording')}"
     )
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from services.cli.parser import Subcommand
 from services.common.errors import InputError
+from services.common.naming import count_of
 from services.common.options import flag, opt, output_folder_option, positional, site_option
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def _export(options: ExportOptions) -> int:
         for number, table in enumerate(tables):
             progress(number, len(tables))
             path = write_table(folder, table, form)
-            print(f"{path}: {len(next(iter(table.columns.values())))} rows")
+            print(f"{path}: {count_of(len(next(iter(table.columns.values()))), 'row')}")
     if found.site is None:
         print("no site file: places of bridges are not known, so there is no GeoJSON")
         return 0

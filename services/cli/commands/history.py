@@ -12,6 +12,7 @@ from services.cli.parser import Subcommand
 from services.cli.parsing import EXIT_SOMETHING_LOST, a_console
 from services.common.errors import InputError
 from services.common.kinds import HISTORY_CSV, HISTORY_JSON, RERUN
+from services.common.naming import count_of
 from services.common.options import (
     file_option,
     flag,
@@ -131,7 +132,7 @@ def _add_one(
     of = f" of {', '.join(sorted(bridges))}" if bridges else ""
     before = f", {there} there already" if there else ""
     beside = f", {warm} with a temperature" if options.temperature is not None else ""
-    return f"{path}: {new} crossing{'' if new == 1 else 's'}{of} added{before}{beside}"
+    return f"{path}: {count_of(new, 'crossing')}{of} added{before}{beside}"
 
 
 def _table(options: HistoryOptions) -> int:
@@ -207,8 +208,8 @@ def _lines(past: "BridgeHistory") -> Iterator[str]:
     bridge, realm, unit, periods, alarms = past[:5]
     number = sum(one.crossings for one in periods)
     yield (
-        f"{bridge} in realm {realm}: {number} crossings in {len(periods)} "
-        f"{unit}{'s' if len(periods) != 1 else ''}; EI in GN·m², ± half of the 95 % interval"
+        f"{bridge} in realm {realm}: {count_of(number, 'crossing')} in "
+        f"{count_of(len(periods), unit)}; EI in GN·m², ± half of the 95 % interval"
     )
     elements = max((len(p.state.elements) for p in periods if p.state), default=0)
     names = "".join(f"{f'EI_{n + 1}':>15}" for n in range(elements))

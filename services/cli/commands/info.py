@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from services.cli.parser import Subcommand
 from services.common.errors import InputError
+from services.common.naming import count_of
 from services.common.options import flag, positional, site_option
 
 if TYPE_CHECKING:
@@ -168,7 +169,7 @@ def lines_of(one: "RecordingSummary") -> Iterator[str]:
         }
     )
     for name, number in sorted(others.items()):
-        yield f"{name}: {_count(number, 'message')}"
+        yield f"{name}: {count_of(number, 'message')}"
     silences = ("silence of more than a second", "silences of more than a second")
     yield from _some(silences, one.gaps, map(_line_of_gap, one.gaps))
     if one.site is not None:
@@ -184,7 +185,7 @@ def _lines_of_truck(truck: "TruckSummary") -> Iterator[str]:
     for name, stream in truck.streams.items():
         rate = f", {stream.rate_hz:.3g} a second" if stream.rate_hz is not None else ""
         missing = f", {stream.missing} missing" if stream.missing else ""
-        yield f"  {name}: {_count(stream.messages, 'message')}{rate}{missing}"
+        yield f"  {name}: {count_of(stream.messages, 'message')}{rate}{missing}"
         if name == "accel" and truck.channel_rates_hz:
             rates = truck.channel_rates_hz
             if len(set(rates.values())) == 1:
@@ -198,8 +199,8 @@ def _gaps_in_words(gaps: "SampleGaps") -> str:
     if not gaps.number:
         return "no gaps in the samples"
     return (
-        f"{_count(gaps.number, 'gap')} in the samples, {gaps.total_s:.3g} s together, the longest "
-        f"{gaps.longest_s:.3g} s; one on a bridge rejects the crossing (gap_on_bridge)"
+        f"{count_of(gaps.number, 'gap')} in the samples, {gaps.total_s:.3g} s together, the "
+        f"longest {gaps.longest_s:.3g} s; one on a bridge rejects the crossing (gap_on_bridge)"
     )
 
 
@@ -259,10 +260,10 @@ def _print_table(found: "list[RecordingSummary]", unreadable: dict[Path, str]) -
     trucks = {truck.vehicle for one in found for truck in one.trucks}
     crossings = _number_of_crossings(found)
     counts = [
-        _count(len(found) + len(unreadable), "recording"),
+        count_of(len(found) + len(unreadable), "recording"),
         _size(sum(one.size_bytes for one in found)),
-        _count(len(trucks), "truck"),
-        _count(crossings, "crossing"),
+        count_of(len(trucks), "truck"),
+        count_of(crossings, "crossing"),
     ]
     print(", ".join(counts))
 
@@ -298,10 +299,6 @@ def _number_of_gaps(one: "RecordingSummary") -> int:
     """Return the number of gaps in samples, and of silences of other streams."""
     silences = sum(gap.stream != "accel" for gap in one.gaps)
     return silences + sum(truck.sample_gaps.number for truck in one.trucks)
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _state(one: "RecordingSummary") -> str:

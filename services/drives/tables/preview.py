@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from services.common.naming import count_of
 from services.drives.runs import Run, grid_index
 from services.drives.tables.reading import Understood
 
@@ -53,7 +54,7 @@ def _of_run(run: Run, width: int) -> list[str]:
     label = max(len(name) for name in curves)
     head = (
         f"{run.source}: {_day(run.accel_time_s[0])}, {seconds:.1f} s at {run.rate_hz:g} Hz, "
-        f"{gaps} gaps, {gnss.time_s.size} fixes"
+        f"{count_of(gaps, 'gap')}, {gnss.time_s.size} fixes"
     )
     return [
         head,

@@ -153,3 +153,14 @@ def test_folder_without_results_is_one_line(
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "results-TIME.json of driveby worker (in FOLDER/REALM) are expected" in error
+
+
+def test_list_of_alarms_of_a_single_bridge(
+    tmp_path: Path, into: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert add(into, tmp_path) == 0
+    capsys.readouterr()
+    assert cli.main(["alarm", "list", "--history", str(tmp_path / "history")]) == 0
+    first, second, third = capsys.readouterr().out.splitlines()
+    assert (first, second) == ("no alarms", "the only bridge is not monitored")
+    assert third.startswith("bridge-1 in realm sim-fleet: Not monitored: ")

@@ -1,6 +1,6 @@
 """The note of a logger's health on clocks."""
 
-from services.logger.health_line import clock_note
+from services.logger.health_line import clock_note, health_line
 
 
 def test_clocks_that_are_ahead_are_named() -> None:
@@ -10,3 +10,10 @@ def test_clocks_that_are_ahead_are_named() -> None:
 
 def test_right_and_slow_clocks_need_no_note() -> None:
     assert clock_note({"clock_offset_s/a": -0.4, "lag_s": -99.0, "clock_offset_s/b": 9.0}) == ""
+
+
+def test_one_truck_and_one_file_are_singular() -> None:
+    line = health_line({"trucks_alive": 1.0, "files": 1.0})
+    assert line.startswith("1 truck, ")
+    assert " to 1 file, " in line
+    assert health_line({}).startswith("0 trucks, ")
