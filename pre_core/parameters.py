@@ -193,11 +193,6 @@ def element_count(theta: FloatArray) -> int:
     return int(theta.shape[-1]) - EI_1
 
 
-def of_part(part: str, elements: int) -> NDArray[np.bool_]:
-    """Return which entries of theta belong to the truck or to the bridge, shape (p,)."""
-    return np.array([row.part == part for row in table(elements)])
-
-
 def mass_powers(elements: int) -> FloatArray:
     """Return the powers (p,) of the total mass to which the entries of theta are proportional."""
     return np.array([row.mass_power for row in table(elements)], dtype=np.float64)

@@ -32,26 +32,6 @@ class EventKind(StrEnum):
     RECORDING_GONE = "recording_gone"
 
 
-EVENT_TEXTS: dict[EventKind, str] = {
-    EventKind.GAP: "Messages are missing and have not been fetched yet.",
-    EventKind.LOST: "Messages are lost: the truck no longer has them.",
-    EventKind.RECOVERED: "Missing messages were fetched and stand later in the file.",
-    EventKind.DROPPED: "Messages were dropped.",
-    EventKind.REFUSED: "Messages were refused: malformed, too large or impossible.",
-    EventKind.DUPLICATES: "Messages came more than once; each was written once.",
-    EventKind.CLOCK_STEP: "A wall clock jumped.",
-    EventKind.CLOCK_DRIFT: "The clocks of truck and logger drift apart.",
-    EventKind.RECONNECTED: "A connection was lost and made again.",
-    EventKind.RESTARTED: "A truck began a new boot.",
-    EventKind.QUEUE_FULL: "The writer's queue was full.",
-    EventKind.WRITE_ERROR: "Writing to disk failed.",
-    EventKind.DISK_LOW: "Little room is left on the disk.",
-    EventKind.RECORDING_RECOVERED: "A recording that was damaged or cut off was rewritten.",
-    EventKind.RECORDING_DELETED: "A recording was deleted to keep within the budget.",
-    EventKind.RECORDING_GONE: "A recording was deleted, cut or moved while it was being written.",
-}
-
-
 class Event(NamedTuple):
     """One event. Fields that do not apply are empty or 0."""
 

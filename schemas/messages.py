@@ -63,11 +63,6 @@ def decode(name: str, payload: bytes) -> Message:
         raise ValueError(f"not a {name}: {error}") from None
 
 
-def check_payload(row: Topic, payload: bytes) -> int:
-    """Return the time in ns since 1970 UTC of a payload that passes `check_stamp`."""
-    return check_stamp(row, payload).wall_time_ns
-
-
 def check_stamp(row: Topic, payload: bytes) -> Stamp:
     """Check a payload as far as its topic allows and return its times and identity.
 

@@ -116,15 +116,6 @@ def direction_to_protobuf(direction: Direction) -> pb.Direction:
     return pb.START_TO_END if direction == "start_to_end" else pb.END_TO_START
 
 
-def direction_from_protobuf(direction: pb.Direction) -> Direction:
-    """Return the direction of travel; raise ValueError if the message does not state it."""
-    if direction == pb.START_TO_END:
-        return "start_to_end"
-    if direction == pb.END_TO_START:
-        return "end_to_start"
-    raise ValueError("the direction of travel is not given")
-
-
 def _crossing(values: dict[str, Any]) -> CrossingResult:
     """Return the result of an Estimate's fields without those of the header."""
     _check_direction(values)

@@ -1,14 +1,30 @@
-"""Identifications whose answers are known at once."""
+"""Identifications of recordings, and some whose answers are known at once."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from schemas.results import CrossingResult
+from schemas.results import CrossingResult, Results
 from schemas.settings import IdentificationSettings
+from schemas.site import Site
+from services.execution.inline import InlineExecutor, Report
+from services.execution.offline import identify_drives, messages_of_trucks
 from services.finding.crossing_data import CrossingData
+from services.finding.order import index_messages
 from services.identification.identify import Stopwatch
 from services.identification.result_parts import CrossingTimes, rejected
+
+
+def identify_recordings(
+    recordings: list[Path],
+    site: Site,
+    settings: IdentificationSettings,
+    report: Report = lambda crossing_id, stage, fraction: None,
+) -> Results:
+    """Identify all crossings in the recordings, in order of time."""
+    drives = index_messages(", ".join(map(str, recordings)), messages_of_trucks(recordings), site)
+    return identify_drives(drives, site, settings, InlineExecutor(report=report), report)
 
 
 @dataclass

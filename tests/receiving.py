@@ -1,4 +1,6 @@
-"""What a subscription of a test must get."""
+"""What a subscription of a test must get, and what is latched."""
+
+import zenoh
 
 from services.bus.subscription import RawSample, Subscription
 from tests.waiting import until
@@ -15,3 +17,10 @@ def several(subscription: Subscription, number: int) -> list[RawSample]:
 
     until(has_enough, f"{number} messages")
     return received
+
+
+def get_latest(session: zenoh.Session, key_expression: str, timeout_s: float = 5.0) -> list[bytes]:
+    """Return the last payload of every latched topic under a key expression."""
+    replies = session.get(key_expression, target=zenoh.QueryTarget.ALL, timeout=timeout_s)
+    samples = [reply.ok for reply in replies]
+    return [sample.payload.to_bytes() for sample in samples if sample is not None]

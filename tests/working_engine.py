@@ -11,7 +11,7 @@ from services.execution.inline import InlineExecutor
 from services.identification.engine import Engine
 from services.identification.known import search_hash
 from services.identification.outputs import Output
-from services.ledger.crossing_log import known_crossings
+from tests.builders.ledger import known_crossings
 
 
 def unhurried() -> InlineExecutor:

@@ -14,7 +14,7 @@ from pre_core.crossing import mismatch as _mismatch
 from pre_core.crossing.lines import project_out
 from pre_core.crossing.mismatch import Mismatch
 from pre_core.crossing.noise import NoisePath, noise_spectrum
-from pre_core.crossing.rows import RESIDUALS, RowFilter, filter_rows, phases, row_count
+from pre_core.crossing.rows import RESIDUALS, RowFilter, filter_rows, phases
 from pre_core.crossing.suspension_noise import FORCE_MEMORY_S
 from pre_core.kernels.lanes import summing
 
@@ -202,23 +202,3 @@ def whiten_into(
         for k in range(row.size):
             out[RESIDUALS * k + i] = row[k]
     solve(noise.factor, noise.reciprocal, out)
-
-
-def white_rows(rows: RowFilter, noise: Whitener, residuals: FloatArray) -> FloatArray:
-    """Return whitened residuals (…, 3 m) of residuals (…, 3, n): filtered and interleaved.
-
-    Their variance is one. Raise ValueError if the whitener is for another number of residuals.
-    """
-    *many, kinds, n = residuals.shape
-    count = row_count(rows, n)
-    if kinds != RESIDUALS or noise.reciprocal.size != RESIDUALS * count:
-        raise ValueError(
-            f"residuals of shape {residuals.shape} give {kinds} x {count} rows, the whitener is "
-            f"for {RESIDUALS} x {noise.reciprocal.size // RESIDUALS}"
-        )
-    flat = np.ascontiguousarray(residuals).reshape(-1, RESIDUALS, n)
-    out = np.empty((flat.shape[0], RESIDUALS * count))
-    row = np.empty(count)
-    for k in range(flat.shape[0]):
-        whiten_into(rows, noise, flat[k], row, out[k])
-    return out.reshape(*many, RESIDUALS * count)

@@ -273,13 +273,3 @@ def interpolation_matrix(beam: Beam, x_m: FloatArray) -> FloatArray:
     rows = np.einsum("mp,mpk->mk", powers, cubics[np.maximum(element, 0)])
     rows[element < 0] = 0.0
     return np.asarray(rows)
-
-
-def static_deflection_m(
-    beam: Beam, load_x_m: FloatArray, load_n: FloatArray, x_m: FloatArray
-) -> FloatArray:
-    """Return the deflection (m,) at `x_m` (m,) under static loads (k,), up positive like these."""
-    force = interpolation_matrix(beam, load_x_m).T @ np.asarray(load_n, dtype=np.float64)
-    return np.asarray(
-        interpolation_matrix(beam, x_m) @ np.linalg.solve(stiffness_matrix(beam), force)
-    )

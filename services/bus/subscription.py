@@ -256,13 +256,6 @@ def subscribe_latest(
         subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
-def get_latest(session: zenoh.Session, key_expression: str, timeout_s: float = 5.0) -> list[bytes]:
-    """Return the last payload of every latched topic under a key expression."""
-    replies = session.get(key_expression, target=zenoh.QueryTarget.ALL, timeout=timeout_s)
-    samples = [reply.ok for reply in replies]
-    return [sample.payload.to_bytes() for sample in samples if sample is not None]
-
-
 class _PublisherGaps:
     """The received numbers of one Zenoh publisher, and the requests for its gaps."""
 

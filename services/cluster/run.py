@@ -31,7 +31,6 @@ from services.execution.hang_watchdog import HangWatchdog, TaskLimits
 from services.execution.scheduler import Credentials, is_loopback, threads_of
 
 _log = logging.getLogger(__name__)
-DEFAULT_PORT: Final = 8786
 _POLL_S = 0.2
 _SOON_S = 10.0
 """Lifetime in s below which a process is restarted with increasing delays."""

@@ -16,28 +16,22 @@ from services.common.errors import InputError
 from services.common.progress import Offset, no_progress
 from services.execution.blas import one_blas_thread
 from services.execution.dispatch import CrossingExecutor, dispatch, drain
-from services.execution.inline import InlineExecutor, Report
+from services.execution.inline import Report
 from services.finding.order import (
     STREAMS,
     MessageIndex,
     Read,
     cached_reader,
     in_measurement_order,
-    index_messages,
     malformed,
 )
 from services.identification.bridge_state import NOTHING_STORED, Fusing, with_common_shares
 from services.identification.engine import Engine
-from services.identification.identify import Keep
 from services.identification.outputs import EngineOutput
 from services.identification.waiting import Validations
 from services.recordings.recording import program_version, read_messages, read_site
 
 _log = logging.getLogger(__name__)
-
-
-def _ignore_progress(crossing_id: str, stage: str, fraction: float) -> None:
-    """Ignore the progress of a crossing."""
 
 
 def site_of(recordings: list[Path], site: Path | None) -> Site:
@@ -76,31 +70,12 @@ def messages_of_trucks(
     return cached_reader(lambda again: of_files((lambda: no_progress) if again else next_file))
 
 
-def identify_recordings(
-    recordings: list[Path],
-    site: Site,
-    settings: IdentificationSettings,
-    report: Report = _ignore_progress,
-    keep: Keep = lambda crossing_id, draws: None,
-    fusing: Fusing = NOTHING_STORED,
-    certificates: Mapping[VehicleBridgePair, str] | None = None,
-) -> Results:
-    """Identify all crossings in the recordings, in order of time; pass their draws to `keep`.
-
-    The results name the `certificates` of their vehicles and bridges, where there are any.
-    """
-    name = ", ".join(str(path) for path in recordings)
-    overview = index_messages(name, messages_of_trucks(recordings), site)
-    execution = InlineExecutor(report=report, keep=keep)
-    return identify_drives(overview, site, settings, execution, report, fusing, certificates)
-
-
 def identify_drives(
     drives: MessageIndex,
     site: Site,
     settings: IdentificationSettings,
     execution: CrossingExecutor,
-    report: Report = _ignore_progress,
+    report: Report,
     fusing: Fusing = NOTHING_STORED,
     certificates: Mapping[VehicleBridgePair, str] | None = None,
 ) -> Results:

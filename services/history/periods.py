@@ -21,7 +21,6 @@ from services.history.history_store import EDITION, HistoryRow, fusable_of
 from services.recordings.recording import program_version
 
 Unit = Literal["day", "week", "month"]
-UNITS: tuple[Unit, ...] = ("day", "week", "month")
 PER_YEAR: dict[Unit, float] = {"day": 365.25, "week": 52.18, "month": 12.0}
 
 

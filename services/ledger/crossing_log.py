@@ -183,13 +183,3 @@ def crossings_named(state: pb.BridgeState) -> Iterator[str]:
     yield from state.crossings_used
     for left_out in state.crossings_left_out:
         yield left_out.crossing_id
-
-
-def known_crossings(
-    messages: Iterable[tuple[Key, bytes]], search: str | None = None
-) -> list[CrossingRecord]:
-    """Return the crossings that messages, in the order of their publication, describe."""
-    log = CrossingLog(search)
-    for key, payload in messages:
-        log.add(key, payload)
-    return log.crossings()

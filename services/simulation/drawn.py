@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import parameters
-from pre_core.physics.bridge import Beam, natural_frequencies_hz
-from pre_core.physics.models import from_models
+from pre_core.physics.bridge import Beam
 from pre_core.physics.road import Profile
 from pre_core.physics.sensors import Accelerometer
 from pre_core.physics.simulate import Motion
@@ -47,11 +46,8 @@ from services.simulation.drive import (
     declared_site,
     half_car,
     measured_run,
-    paper_site,
     with_two_axles,
 )
-from services.simulation.drive_wide import LONGEST_STEP_S as LONGEST_WIDE_STEP_S
-from services.simulation.drive_wide import Width, measured_wide_run
 from services.simulation.positions import Instruments, TimedMotion, receiver_of
 from services.simulation.wheel_paths import WheelPaths
 
@@ -75,8 +71,6 @@ _CHANGING_SHARE = 0.4
 so are all where the height of the centre of gravity is unknown."""
 _STEADY_M_PER_S2, _CHANGING_M_PER_S2 = (0.0, 0.1), (0.1, 1.0)
 _PERIOD_S = (6.0, 16.0)
-_CG_HEIGHT_M = 1.1
-"""Height of a loaded truck's centre of gravity above the road."""
 _LARGEST_CHANGE = 0.3
 """Largest relative change of speed in either direction."""
 
@@ -144,8 +138,6 @@ class CrossingTruth(NamedTuple):
     """Vehicle on the bridge before."""
     paths: WheelPaths | None = None
     """Wheel paths on a 2-D road surface; None: both axles follow one profile."""
-    width: Width | None = None
-    """Properties of truck and bridge beyond the plane; None: none."""
 
 
 class SimulatedCrossing(NamedTuple):
@@ -171,14 +163,7 @@ class IdentifiedCrossing(NamedTuple):
     data: CrossingData
     settings: IdentificationSettings
     draws: dict[str, Floats] | None = None
-    """Posterior draws (n,) by the names of `true_values`; None where a method has none."""
-
-
-def default_site() -> Site:
-    """Return the paper's truck and bridge, with a known height of the centre of gravity."""
-    site = paper_site()
-    vehicle = site.vehicles[0].model_copy(update={"cg_height_m": _CG_HEIGHT_M})
-    return site.model_copy(update={"vehicles": (vehicle,)})
+    """Posterior draws (n,) by the names of docs/contract.md; None where a method has none."""
 
 
 def draw_truth(site: Site, seed: int) -> CrossingTruth:
@@ -282,42 +267,18 @@ def drive(
     The noise is that of the conditions, unless that of each channel is given.
     """
     bridge, how = site.bridges[0], truth.conditions
-    longest_s = LONGEST_STEP_S if truth.width is None else LONGEST_WIDE_STEP_S
-    every = max(1, int(np.ceil(1.0 / (how.rate_hz * longest_s))))
+    every = max(1, int(np.ceil(1.0 / (how.rate_hz * LONGEST_STEP_S))))
     step_s = 1.0 / (how.rate_hz * every)
     settling = round(SETTLE_S * how.rate_hz) * every
     densities = noise_ug_per_rthz or how.densities_ug_per_rthz
-    instruments = _instruments(site, truth, densities, seed)
-    if truth.width is not None:
-        halves = _motion(truth, bridge, 0.5 * step_s, 2 * every)
-        wide = measured_wide_run(
-            bridge,
-            truth.car,
-            truth.beam,
-            truth.width,
-            TimedMotion(halves, step_s, settling),
-            (how.road_class, how.road_seed),
-            instruments,
-        )
-        of_channels = np.array(densities) / (np.sqrt(2.0) if truth.width.sensors else 1.0)
-        return SimulatedCrossing(
-            truth,
-            wide.run,
-            declared_site(site, tuple(of_channels.tolist()), how.rate_hz),
-            Motion(*(values[::2] for values in halves)),
-            float(wide.run.accel_time_s[0]) - settling * step_s,
-            step_s,
-            wide.road,
-            wide.largest_deflection_m,
-        )
-    motion = _motion(truth, bridge, step_s, every)
+    motion = motion_of(truth, bridge, step_s, every)
     run, roads, happened = measured_run(
         bridge,
         truth.car,
         truth.beam,
         TimedMotion(motion, step_s, settling),
         DrivenRoad(how.road_class, how.road_seed, truth.paths),
-        instruments,
+        instruments_of(site, truth, densities, seed),
         truth.left,
     )
     return SimulatedCrossing(
@@ -332,7 +293,7 @@ def drive(
     )
 
 
-def _instruments(
+def instruments_of(
     site: Site, truth: CrossingTruth, densities: Sequence[float], seed: int
 ) -> Instruments:
     """Return the accelerometers of the four channels and the receiver, with their errors."""
@@ -354,7 +315,7 @@ def _instruments(
     return Instruments(sensors, receiver, rng, vehicle.gps_antenna_to_front_axle_m)
 
 
-def _motion(truth: CrossingTruth, bridge: Bridge, step_s: float, every: int) -> Motion:
+def motion_of(truth: CrossingTruth, bridge: Bridge, step_s: float, every: int) -> Motion:
     """Return the motion from `SETTLE_S` + `_BEFORE_S` before entry to `_AFTER_S` after exit."""
     how, car = truth.conditions, truth.car
     omega = 2.0 * np.pi / how.period_s
@@ -416,20 +377,3 @@ def of_any_bridge(result: CrossingResult) -> CrossingResult:
 
 def _flat(draws: dict[str, Floats] | None) -> dict[str, Floats] | None:
     return None if draws is None else {name: values.ravel() for name, values in draws.items()}
-
-
-def true_values(truth: CrossingTruth) -> dict[str, float]:
-    """Return the truth under the names of docs/contract.md."""
-    car, beam = truth.car, truth.beam
-    vector = from_models(car, beam)
-    names = parameters.names(beam.flexural_rigidity_nm2.size)
-    values = dict(zip(names, vector.tolist(), strict=True))
-    d_1 = car.front_axle_to_cg_m
-    rear_share = d_1 / car.wheelbase_m
-    return values | {
-        "m_s": car.body_mass_kg,
-        "m_s1": car.body_mass_kg * (1.0 - rear_share),
-        "m_s2": car.body_mass_kg * rear_share,
-        "wheelbase": car.wheelbase_m,
-        "f1_hz": float(natural_frequencies_hz(beam, 1)[0]),
-    }

@@ -14,7 +14,7 @@ from services.common.errors import InputError
 from services.drives.runs import Run
 from services.simulation.drawn import ChannelErrors, CrossingTruth
 from services.simulation.drive_tandem import TandemDrive, tandem_case, truck_with_tandem
-from services.simulation.wheel_paths import SurfaceOptions
+from services.simulation.wheel_paths import WANDER_M, SurfaceOptions
 from services.simulation.wide_crossings import (
     SatelliteErrors,
     WideCase,
@@ -23,8 +23,6 @@ from services.simulation.wide_crossings import (
     WideSensor,
     drive_case,
 )
-
-WANDER_M: Final = 0.12
 
 
 class TandemWorld(NamedTuple):

@@ -27,7 +27,6 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from pre_core.constants import NORMAL_975
-from pre_core.diagnostics.calibration import root_mean_square
 from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Site, Vehicle
@@ -47,8 +46,7 @@ from services.recordings.recording import program_version
 from services.simulation.drawn import CrossingTruth, draw_truth, drive, identify_simulated
 from services.simulation.drawn_tandem import drawn_tandem
 from services.simulation.drive import beam_of
-from services.simulation.out_of_model import WANDER_M
-from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
+from services.simulation.wheel_paths import WANDER_M, SurfaceOptions, wheel_paths_of
 
 _log = logging.getLogger(__name__)
 
@@ -357,7 +355,7 @@ def figures_of(tried: Sequence[ValidationCrossing]) -> ValidationFigures:
         good=len(good),
         intervals=z.size,
         covered=sum(int(e.is_covered.sum()) for e in errors),
-        rms_z=root_mean_square(z) if z.size else None,
+        rms_z=float(np.sqrt(np.mean(z * z))) if z.size else None,
         largest_z_good=max(good, default=None),
         std=float(np.median(np.concatenate([e.std_log for e in errors]))) if errors else None,
         weak=len(weak),

@@ -31,6 +31,8 @@ from services.simulation.pavement import (
 
 REAR_OFFSET_M: Final = 0.005
 """Lateral offset of the rear axle; axles are aligned to millimetres."""
+WANDER_M: Final = 0.12
+"""Usual lateral wander of a truck."""
 REACH_M: Final = 150.0
 """Extent of a surface beyond both ends of the bridge, or a multiple: runs within the same extent,
 fast or slow, either way, drive over the same road."""

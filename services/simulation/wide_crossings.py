@@ -1,24 +1,20 @@
-"""Crossings of trucks and bridges with width: their sensors, and folders of files.
+"""Crossings of trucks and bridges with width, and their sensors.
 
 A case is one truck, bridge, road, set of sensors and the site file of its owner, with any number of
-runs. `two_sided` simulates it, `wide_cases` draws some. Accelerometers have gain, delay, bias and
-white noise; a receiver has a slow error, which is constant during a run, and white ones.
+runs. `two_sided` simulates it. Accelerometers have gain, delay, bias and white noise; a receiver
+has a slow error, which is constant during a run, and white ones.
 
-    case = draw_wide(3)
-    write_folder(Path("w3"), case)                       # as shared crossings: CSV, site, truth
     found = identify_simulated([drive_case(case, 0).run], site_of(case), IdentificationSettings())
 """
 
-import json
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.constants import MICRO_G_M_PER_S2
-from schemas.site import Bridge, Site
+from schemas.site import Site
 from schemas.site_file import parse_site, toml_of
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run
@@ -30,7 +26,6 @@ from services.simulation.two_sided import (
     body_row,
     cross,
     even_motion,
-    static_axle_loads_n,
     tyres_of,
 )
 from services.simulation.two_sided_deck import Deck
@@ -47,8 +42,6 @@ _BEFORE_M, _BEHIND_M = 30.0, 25.0
 _ROAD_SPACING_M = 0.02
 _FIX_RATE_HZ = 10.0
 _ALTITUDE_M, _ALTITUDE_NOISE_M = 20.0, 0.2
-
-PAIR_NAMES: Final = ("sprung_front", "sprung_rear", "unsprung_front", "unsprung_rear")
 
 
 class WideSensor(NamedTuple):
@@ -80,7 +73,6 @@ class SatelliteErrors(NamedTuple):
 
 
 USUAL_RECEIVER: Final = SatelliteErrors()
-RTK: Final = SatelliteErrors(0.02, 0.02, 0.02)
 
 
 class WideRun(NamedTuple):
@@ -270,112 +262,13 @@ def _fixes(
     )
 
 
-def middle_channels(
-    channels: Mapping[str, Floats], sensors: Sequence[WideSensor]
-) -> dict[str, Floats]:
-    """Average sensors left and right of the same place into the four centre channels.
-
-    Body places and axles are front and rear in their order. Raise ValueError where sensors of one
-    place have no mean on the centre line.
-    """
-    found: dict[str, Floats] = {}
-    for on, names in (("body", PAIR_NAMES[:2]), ("axle", PAIR_NAMES[2:])):
-        of = [sensor for sensor in sensors if sensor.on == on]
-        places = sorted({(sensor.axle, sensor.position_m) for sensor in of})
-        for name, place in zip(names, places, strict=True):
-            there = [sensor for sensor in of if (sensor.axle, sensor.position_m) == place]
-            if abs(sum(sensor.lateral_m for sensor in there)) > 1e-9:
-                raise ValueError(f"{there[0].channel} and what is with it are not symmetric")
-            found[name] = np.mean([channels[sensor.channel] for sensor in there], axis=0)
-    return found
-
-
-def site_text(case: WideCase, *, with_width: bool = True) -> str:
-    """Return the owner's site file; `with_width` False omits keys that only width needs."""
-    tables = {
-        table: {
-            key: value
-            for key, value in case.declared[table].items()
-            if with_width or not _is_of_width(key, value)
-        }
-        for table in ("vehicle", "bridge", "sensor")
-    }
-    return "# All SI.\n" + toml_of(tables)
-
-
-def _is_of_width(key: str, value: object) -> bool:
-    torsion = ("lane_offset_m", "torsional_frequency_ratio", "deck_gyration_m")
-    return key in torsion or (key == "track_m" and isinstance(value, list))
+def site_text(case: WideCase) -> str:
+    """Return the owner's site file."""
+    return "# All SI.\n" + toml_of(
+        {table: dict(case.declared[table]) for table in ("vehicle", "bridge", "sensor")}
+    )
 
 
 def site_of(case: WideCase) -> Site:
     """Return the owner's site file as the program reads it."""
-    return parse_site(
-        site_text(case, with_width="lane_offset_m" in Bridge.model_fields), f"{case.name}.toml"
-    )
-
-
-def write_folder(folder: Path, case: WideCase) -> None:
-    """Write accel_NN.csv, gps_NN.csv, site.toml and truth.json of all runs to a new folder."""
-    folder.mkdir(parents=True)
-    runs = []
-    for number, how in enumerate(case.runs):
-        driven = drive_case(case, number)
-        run = driven.run
-        header = "time_s," + ",".join(run.channels)
-        rows = np.column_stack([run.accel_time_s, *run.channels.values()])
-        formats = ["%.6f"] + ["%.5f"] * len(run.channels)
-        np.savetxt(
-            folder / f"accel_{number:02d}.csv", rows, formats, ",", header=header, comments=""
-        )
-        gnss = run.gnss
-        np.savetxt(
-            folder / f"gps_{number:02d}.csv",
-            np.column_stack(
-                [
-                    gnss.time_s,
-                    gnss.latitude_deg,
-                    gnss.longitude_deg,
-                    gnss.altitude_m,
-                    gnss.speed_m_per_s,
-                ]
-            ),
-            ["%.3f", "%.8f", "%.8f", "%.2f", "%.3f"],
-            ",",
-            header="time_s,latitude_deg,longitude_deg,altitude_m,speed_mps",
-            comments="",
-        )
-        runs.append(
-            {
-                "speed_mps": how.speed_m_per_s,
-                "t0": float(run.accel_time_s[0]),
-                "entry": driven.entry_s,
-                "exit": driven.exit_s,
-                "direction": "start_to_end" if how.forward else "end_to_start",
-                "max_deflection_mm": -1e3 * float(driven.response.deflection_m.min()),
-            }
-        )
-    (folder / "site.toml").write_text(site_text(case), encoding="utf-8")
-    (folder / "truth.json").write_text(
-        json.dumps(truth_of(case) | {"runs": runs}, indent=1) + "\n", encoding="utf-8"
-    )
-
-
-def truth_of(case: WideCase) -> dict[str, Any]:
-    """Return the simulator's values, for evaluating results only."""
-    truck, deck = case.truck, case.deck
-    return {
-        "EI": list(deck.flexural_rigidity_nm2),
-        "EI_ratio": [ei / case.undamaged_nm2 for ei in deck.flexural_rigidity_nm2],
-        "truck": {
-            "bodies": [body._asdict() for body in truck.bodies],
-            "axles": [axle._asdict() for axle in truck.axles],
-            "bogies": [bogie._asdict() for bogie in truck.bogies],
-            "kingpin": None if truck.kingpin is None else truck.kingpin._asdict(),
-            "axle_loads_n": static_axle_loads_n(truck).tolist(),
-        },
-        "torsion": None if deck.torsion is None else deck.torsion._asdict(),
-        "lane_offset_m": case.lane_offset_m,
-        "road": {"class": case.road_class, "seed": case.road_seed, "one_road": case.is_one_road},
-        "sensors": [sensor._asdict() for sensor in case.sensors],
-    }
+    return parse_site(site_text(case), f"{case.name}.toml")

@@ -22,7 +22,6 @@ from rich.console import Console
 from rich.table import Table
 
 from pre_core.crossing import posterior
-from pre_core.crossing.bound import central_jacobian
 from pre_core.crossing.compliances import to_compliance_coordinates
 from pre_core.crossing.mismatch import BridgePavement
 from pre_core.crossing.noise import no_suspension_noise
@@ -32,10 +31,11 @@ from pre_core.crossing.preparation import update_noise
 from pre_core.survey.plan import PosteriorAtTruth
 from schemas.settings import IdentificationSettings
 from services.simulation.data_alone import crossing_data_only
-from services.simulation.drawn import SimulatedCrossing, default_site, drive, identify_simulated
+from services.simulation.drawn import SimulatedCrossing, drive, identify_simulated
 from services.simulation.pavement import Pavement
 from services.simulation.survey_kinds import KINDS
-from studies.validation.bound import at_truth
+from studies.simulation.truths import default_site
+from studies.validation.bound import at_truth, central_jacobian
 from studies.validation.calibration import Record, record
 from studies.validation.surveys import crossing_truth, site_of_truck
 from studies.validation.worlds import HEADINGS, cells, completed, lines_of, read_records

@@ -2,7 +2,7 @@
 
     python -m studies.scripts.tandems --kinds loaded aside --crossings 40 --records FILE
 
-Each crossing is drawn by `services.simulation.tandem_cases`, simulated by `two_sided`, which shares
+Each crossing is drawn by `studies.simulation.tandem_cases`, simulated by `two_sided`, which shares
 no code with the method, and identified by the owner's site file. Finished crossings are kept in the
 file of records and not run again. Half a minute to a minute each on a quiet core.
 """
@@ -18,8 +18,8 @@ from rich.console import Console
 
 from schemas.settings import IdentificationSettings
 from services.simulation.drawn import identify_simulated
-from services.simulation.tandem_cases import TandemOptions, draw_tandem
 from services.simulation.wide_crossings import WideCase, drive_case, site_of
+from studies.simulation.tandem_cases import TandemOptions, draw_tandem
 
 Floats = NDArray[np.float64]
 

@@ -21,12 +21,10 @@ from numpy.typing import NDArray
 
 from pre_core import parameters
 from pre_core.crossing import posterior
-from pre_core.crossing.bound import DIFFERENCE, central_jacobian, optimise_subset
 from pre_core.crossing.compliances import to_compliance_coordinates
 from pre_core.crossing.mismatch import expected_levels, mismatch_spectra
 from pre_core.crossing.pavement import known_pavement
 from pre_core.crossing.preparation import build_problem, to_standardised, update_noise
-from pre_core.diagnostics.calibration import truncated_covariance
 from pre_core.physics.vehicle import total_mass_kg
 from pre_core.survey.plan import PosteriorAtTruth as AtTruth
 from pre_core.survey.plan import (
@@ -37,14 +35,19 @@ from pre_core.survey.plan import (
     survey_spreads,
 )
 from services.simulation.data_alone import inputs_of_seen
-from services.simulation.drawn import (
-    CrossingTruth,
-    IdentifiedCrossing,
-    SimulatedCrossing,
-    true_values,
-)
+from services.simulation.drawn import CrossingTruth, IdentifiedCrossing, SimulatedCrossing
+from studies.simulation.truths import true_values
+from studies.validation.calibration_statistics import truncated_covariance
 
 Floats = NDArray[np.float64]
+
+DIFFERENCE = 1e-4
+"""Step of a central difference in the posterior's coordinates: multiples of a prior's spread, and
+metres of the trajectory. Halving it changes every bound by less than 0.1 %."""
+_NUISANCE_STEPS = 20
+"""Limit of steps; `_ENOUGH` usually ends the search earlier."""
+_ENOUGH = 0.01
+"""Gain in the sum of squares, whose standard deviation is tens, that ends the search."""
 
 
 class Bound(NamedTuple):
@@ -282,3 +285,49 @@ def _best_offset(problem: posterior.PosteriorProblem, y: Floats) -> float:
     return float(
         column[on] @ (problem.receiver_values - trajectory)[on] / (column[on] @ column[on])
     )
+
+
+def central_jacobian(
+    problem: posterior.PosteriorProblem,
+    y: Floats,
+    columns: NDArray[np.int64],
+    step: float = DIFFERENCE,
+) -> Floats:
+    """Return derivatives (rows, columns) of all residuals at y (size,) by central differences.
+
+    For coordinates that must not be negative both points are moved up so that none is below zero.
+    """
+    begin = y[columns] - step
+    bounded = np.isin(columns, posterior.layout(problem).half_normal)
+    begin[bounded] = np.maximum(begin[bounded], 0.0)
+    moved = np.repeat(y[None, :], 2 * columns.size, axis=0)
+    moved[np.arange(columns.size), columns] = begin + 2.0 * step
+    moved[columns.size + np.arange(columns.size), columns] = begin
+    values = posterior.all_rows(problem, moved)
+    return np.asarray((values[: columns.size] - values[columns.size :]).T / (2.0 * step))
+
+
+def optimise_subset(
+    problem: posterior.PosteriorProblem,
+    y: Floats,
+    columns: NDArray[np.int64],
+    steps: int = _NUISANCE_STEPS,
+) -> Floats:
+    """Return the best y (size,) in these columns, the others fixed: damped Gauss-Newton."""
+    rows = posterior.all_rows(problem, y[None, :])[0]
+    for _ in range(steps):
+        jacobian = central_jacobian(problem, y, columns)
+        move = np.linalg.lstsq(jacobian, -rows, rcond=None)[0]
+        for share in (1.0, 0.5, 0.25, 0.1, 0.02):
+            tried = y.copy()
+            tried[columns] += share * move
+            new = posterior.all_rows(problem, tried[None, :])[0]
+            if np.all(np.isfinite(new)) and new @ new < rows @ rows:
+                break
+        else:
+            return y
+        is_there = rows @ rows - new @ new < _ENOUGH
+        y, rows = tried, new
+        if is_there:
+            return y
+    return y

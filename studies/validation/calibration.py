@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from pre_core import parameters
 from pre_core.constants import NORMAL_975
-from pre_core.diagnostics import calibration
-from pre_core.diagnostics.calibration import Scores
 from pre_core.physics.road import Profile
 from schemas.results import CrossingResult, Parameter
 from schemas.settings import IdentificationSettings
@@ -28,9 +26,11 @@ from services.simulation.drawn import (
     draw_truth,
     drive,
     identify_simulated,
-    true_values,
 )
+from studies.simulation.truths import true_values
+from studies.validation import calibration_statistics as statistics
 from studies.validation.bound import bound_at_truth
+from studies.validation.calibration_statistics import Scores
 
 Floats = NDArray[np.float64]
 Record = dict[str, Any]
@@ -118,13 +118,13 @@ def _ranks(
     """
     rng = np.random.default_rng(np.random.SeedSequence([seed, 0x71E5]))
     ranks = {
-        name: calibration.rank_from_quantiles(truth[name], p.q025, p.q50, p.q975)
+        name: statistics.rank_from_quantiles(truth[name], p.q025, p.q50, p.q975)
         for name, p in estimates.items()
         if name in truth
     }
     for name, values in (draws or {}).items():
         if name in truth:
-            (ranks[name],) = calibration.rank(
+            (ranks[name],) = statistics.rank(
                 values[:, None], np.array([truth[name]]), rng.uniform(size=1)
             ).tolist()
     return ranks
@@ -261,11 +261,11 @@ def ranks_of(records: list[Record]) -> dict[str, Floats]:
     }
 
 
-def rank_tests(records: list[Record]) -> dict[str, dict[str, calibration.Uniformity]]:
+def rank_tests(records: list[Record]) -> dict[str, dict[str, statistics.Uniformity]]:
     """Return by group and parameter whether the truth's ranks are uniform."""
     names = groups_of(records)
     return {
-        group: {name: calibration.uniformity(ranks[:, k]) for k, name in enumerate(names[group])}
+        group: {name: statistics.uniformity(ranks[:, k]) for k, name in enumerate(names[group])}
         for group, ranks in ranks_of(records).items()
         if ranks.shape[0] >= _FEWEST_RANKS
     }
@@ -276,7 +276,7 @@ def checks(records: list[Record]) -> list[Aim]:
     s = scores(records)
     if s.seeds.size < 2:
         return [Aim("crossings with numbers", float(s.seeds.size), 2.0, np.inf)]
-    pooled = calibration.pooled_share(s.is_covered.astype(np.float64))
+    pooled = statistics.pooled_share(s.is_covered.astype(np.float64))
     each = s.is_covered.mean(axis=0)
     ratio = float(np.nanmean(s.std_log) / np.nanmean(s.bound))
     good = np.mean([line["verdict"] == "good" for line in records])
@@ -286,15 +286,15 @@ def checks(records: list[Record]) -> list[Aim]:
         Aim("pooled coverage", pooled.value, 0.93, 0.97, f"± {pooled.error:.3f}"),
         Aim("coverage of each element, least", float(each.min()), 0.90, 0.99),
         Aim("coverage of each element, most", float(each.max()), 0.90, 0.99),
-        Aim("root mean square of z, ln EI", calibration.root_mean_square(s.z_log), 0.9, 1.15),
-        Aim("root mean square of z, EI", calibration.root_mean_square(s.z), 0.9, 1.15),
+        Aim("root mean square of z, ln EI", statistics.root_mean_square(s.z_log), 0.9, 1.15),
+        Aim("root mean square of z, EI", statistics.root_mean_square(s.z), 0.9, 1.15),
         Aim("mean standard deviation over bound", ratio, 0.0, 1.25),
         Aim("share good", float(good), 0.95, 1.0),
         Aim("largest |z| among good", float(worst.max()) if worst.size else None, 0.0, 5.0),
         *(
             Aim(
                 f"ranks of {group}, p",
-                calibration.bonferroni_p_value(
+                statistics.bonferroni_p_value(
                     np.array([test.p_value for test in of_group.values()])
                 ),
                 SMALLEST_P,
@@ -348,6 +348,6 @@ def by_condition(records: list[Record]) -> list[tuple[str, int, float, float | N
         s = scores(chosen)
         good = float(np.mean([line["verdict"] == "good" for line in chosen]))
         covered = float(s.is_covered.mean()) if s.seeds.size else None
-        rms = calibration.root_mean_square(s.z_log) if s.seeds.size else None
+        rms = statistics.root_mean_square(s.z_log) if s.seeds.size else None
         rows.append((name, len(chosen), good, covered, rms))
     return rows

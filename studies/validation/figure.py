@@ -14,10 +14,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MultipleLocator, PercentFormatter
 
-from pre_core.diagnostics.calibration import Scores
 from services.common.files import write_atomically
 from services.viewer.crossing_view import VEHICLE_COLOURS, FloatArray
 from services.viewer.drawing import DPI, GRID, INK, MUTED, STYLE
+from studies.validation.calibration_statistics import Scores
 
 WIDTH_IN, HEIGHT_IN = 9.0, 7.0
 _POINT, _OTHER = VEHICLE_COLOURS["front"], VEHICLE_COLOURS["rear"]

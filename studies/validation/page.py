@@ -106,7 +106,7 @@ _WORLDS = """
 
 Crossings whose truck and bridge are drawn as above, but on free and rigid bearings and undamped
 tyres; then with one effect, or with all but the surface, torsion, left-and-right and pavement,
-which are on roads of their own (`services/simulation/out_of_model.py` explains each and has the
+which are on roads of their own (`studies/simulation/out_of_model.py` explains each and has the
 ranges, none a prior of the method). Answered is what is not rejected; covered is the share
 of the 95 % intervals of EI that hold the truth, of all that were answered and of those that are
 `good`; z is the error over the standard deviation: its mean over all elements and that of the worst

@@ -8,8 +8,8 @@ from schemas.site_file import load_site
 from services.common.files import check_writable, make_folder, write_atomically
 from services.common.progress import progress_bar
 from services.finding.placed import middle_site
-from services.simulation.drawn import default_site
 from services.simulation.validation_options import IntervalOptions
+from studies.simulation.truths import default_site
 from studies.validation.calibration import Aim, by_condition, ranks_of, scores
 from studies.validation.uncertainty import (
     ValidationOutcome,

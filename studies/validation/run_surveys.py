@@ -7,8 +7,8 @@ from schemas.site_file import load_site
 from services.common.files import make_folder
 from services.common.progress import progress_bar, steps_bar
 from services.finding.placed import middle_site
-from services.simulation.drawn import default_site
 from services.simulation.validation_options import SurveyOptions
+from studies.simulation.truths import default_site
 from studies.validation import detection
 from studies.validation.forecasts import forecasts_of
 from studies.validation.surveys import HEADINGS, fused_surveys, rows, run_surveys, survey_checks

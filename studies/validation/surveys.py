@@ -27,11 +27,11 @@ from services.identification.bridge_state import RecentCrossings, add_crossings,
 from services.simulation.drawn import CrossingTruth, draw_truth, drive, identify_simulated
 from services.simulation.drawn_tandem import TandemWorld, drawn_tandem
 from services.simulation.drive import declared_site, ratios_of
-from services.simulation.out_of_model import draw_out_of_model
 from services.simulation.pavement import Pavement
 from services.simulation.survey_kinds import KINDS, SurveyKind
 from services.simulation.usual_trucks import usual_tandem
 from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
+from studies.simulation.out_of_model import draw_out_of_model
 from studies.validation.calibration import Aim, Record
 from studies.validation.worlds import completed, identity_of, read_records
 

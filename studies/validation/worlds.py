@@ -1,7 +1,7 @@
 """Misspecification study: the uncertainty where truck and bridge have out-of-model effects.
 
-The crossings are those of `simulation.out_of_model`, each effect alone and all together. Records
-are appended to a file of JSON lines as soon as they are computed, and existing ones are not
+The crossings are those of `studies.simulation.out_of_model`, each effect alone and all together.
+Records are appended to a file of JSON lines as soon as they are computed, and existing ones are not
 computed again: hours of crossings can be resumed. Another program, site or settings give other
 crossings.
 """
@@ -20,10 +20,10 @@ from schemas.site import Site
 from schemas.site_file import site_hash
 from services.common.errors import InputError
 from services.recordings.recording import program_version
-from services.simulation.drawn import drive, identify_simulated
-from services.simulation.drive_wide import Width
+from services.simulation.drawn import identify_simulated
 from services.simulation.effects import SURFACE
-from services.simulation.out_of_model import draw_out_of_model
+from studies.simulation.drive_wide import Width
+from studies.simulation.out_of_model import draw_out_of_model, drive_out_of_model
 from studies.validation.bound import bound_at_truth
 from studies.validation.calibration import Aim, Record, in_processes, record
 
@@ -65,7 +65,7 @@ def one_world(site: Site, effect: str, seed: int, settings: IdentificationSettin
     """Simulate, identify and judge one crossing; see `calibration.record`."""
     world = draw_out_of_model(site, effect, seed)
     left, paths = world.beyond.left, world.truth.paths
-    drawn = drive(world.site, world.truth, seed)
+    drawn = drive_out_of_model(world, seed)
     found = identify_simulated([drawn.run], drawn.site, settings)
     seen = found[0] if len(found) == 1 else None
     # Only there does the truth contain noise that a model of one road lacks.
@@ -86,7 +86,7 @@ def one_world(site: Site, effect: str, seed: int, settings: IdentificationSettin
                 "wander_m": paths.wander_m,
                 "pavement": paths.pavement._asdict(),
             },
-            "width": None if world.truth.width is None else _width_of(world.truth.width),
+            "width": None if world.width is None else _width_of(world.width),
             "friction_length_m": world.truth.car.friction_length_m,
             "interior_supports_m": world.site.bridges[0].interior_supports_m,
         },

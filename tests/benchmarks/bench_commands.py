@@ -49,7 +49,8 @@ import cProfile, json, pstats, sys, time
 from pathlib import Path
 began = time.perf_counter()
 from schemas.settings import IdentificationSettings
-from services.execution.offline import identify_recordings, site_of
+from services.execution.offline import site_of
+from tests.identifications import identify_recordings
 imported = time.perf_counter()
 recordings = [Path(sys.argv[1])]
 settings = IdentificationSettings.model_validate({"method": "least_squares", "seed": 0})
@@ -92,7 +93,8 @@ import pre_core  # numba and NumPy, and what of NumPy is put off before SciPy co
 import google.protobuf.message, mcap.records, pydantic, scipy.linalg, scipy.special, zstandard
 mark("libraries imported: numba, SciPy, NumPy, pydantic, protobuf")
 from schemas.settings import IdentificationSettings
-from services.execution.offline import identify_recordings, site_of
+from services.execution.offline import site_of
+from tests.identifications import identify_recordings
 from services.execution import warm_up
 mark("our modules imported")
 from pre_core.physics.vehicle import masses_above_axles

@@ -32,7 +32,7 @@ _MEMORY = """
 import sys
 from pathlib import Path
 from schemas.settings import IdentificationSettings
-from services.execution.offline import identify_recordings
+from tests.identifications import identify_recordings
 from services.simulation.drive import paper_site
 identify_recordings([Path(sys.argv[1])], paper_site(), IdentificationSettings())
 lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())

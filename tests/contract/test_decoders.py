@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas import events, signals
-from schemas.messages import check_payload, decode
+from schemas.messages import check_stamp, decode
 from schemas.proto import driveby_pb2 as pb
 from schemas.topics import TOPICS, Topic, topic
 
@@ -56,7 +56,7 @@ def one_line(call: Callable[[], Any]) -> None:
 
 @given(st.sampled_from(WITH_MESSAGE), st.binary(max_size=300))
 def test_any_bytes(row: Topic, payload: bytes) -> None:
-    one_line(lambda: check_payload(row, payload))
+    one_line(lambda: check_stamp(row, payload))
     one_line(lambda: decode(row.message, payload))
 
 
@@ -67,8 +67,8 @@ def test_valid_bytes_with_one_changed_or_cut_off(stream: str, data: st.DataObjec
     payload[at] = data.draw(st.integers(0, 255))
     cut = data.draw(st.integers(0, len(payload)))
     row = topic("service" if stream == "event" else "vehicle", stream)
-    one_line(lambda: check_payload(row, bytes(payload)))
-    one_line(lambda: check_payload(row, bytes(payload[:cut])))
+    one_line(lambda: check_stamp(row, bytes(payload)))
+    one_line(lambda: check_stamp(row, bytes(payload[:cut])))
 
 
 @given(
@@ -255,7 +255,7 @@ def test_unknown_altitude_is_nan_and_never_zero() -> None:
 def test_too_large() -> None:
     row = topic("vehicle", "gnss")
     with pytest.raises(ValueError, match="vehicle/gnss: 4097 bytes; at most 4096"):
-        check_payload(row, b"\x00" * 4097)
+        check_stamp(row, b"\x00" * 4097)
 
 
 def test_importing_signals_is_cheap() -> None:

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 from schemas.results import CrossingResult, Method
 from schemas.settings import IdentificationSettings
-from services.execution.offline import identify_recordings, site_of
+from services.execution.offline import site_of
+from tests.identifications import identify_recordings
 
 PROJECT = Path(__file__).parents[2]
 REFERENCE = Path(__file__).with_name("reference_estimate.json")

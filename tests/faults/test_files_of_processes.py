@@ -15,10 +15,10 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.topics import selector
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
-from services.bus.subscription import get_latest
 from services.common.errors import InputError
 from services.recordings.recording import is_closed, read_info, read_messages
 from services.recordings.recovery import recovered_path
+from tests.receiving import get_latest
 from tests.waiting import LONGEST_S, until
 
 pytestmark = pytest.mark.process

@@ -22,13 +22,14 @@ from schemas.topics import selector
 from services.bus.credentials import CONFIGURATION, Subject, link_settings
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
-from services.bus.subscription import RawSample, Subscription, get_latest
+from services.bus.subscription import RawSample, Subscription
 from services.common.errors import FailureError
 from services.security import certs
 from services.security.certs import certs_command
 from services.security.settings import CertsSettings
 from tests.endpoints import free_endpoint
 from tests.intruders import V1, listen_to, put_all, raw_session, settle
+from tests.receiving import get_latest
 from tests.waiting import LONGEST_S, until
 
 REFUSED_S = 2.0

@@ -17,7 +17,7 @@ from pre_core.crossing.noise import no_suspension_noise, noise_path
 from pre_core.crossing.residuals import evaluate
 from pre_core.crossing.rows import row_count, row_filter
 from pre_core.crossing.step_tables import sinc_table, step_table
-from pre_core.crossing.whitening import white_rows, whitener
+from pre_core.crossing.whitening import whitener
 from pre_core.paper import experiment
 from pre_core.physics.beam_basis import BeamBasis, beam_basis
 from pre_core.physics.bridge import Beam, refine
@@ -36,6 +36,7 @@ from schemas.signals import CHANNELS
 from schemas.site import Site
 from services.simulation import drive as site_drive
 from services.simulation.drive import paper_site
+from tests.numerics.whitened import white_rows
 
 if TYPE_CHECKING:
     from services.simulation.drive import SimulatedDrive

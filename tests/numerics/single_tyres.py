@@ -8,8 +8,9 @@ from pre_core.search import levenberg_marquardt
 from pre_core.search.loop import Termination
 from schemas.settings import IdentificationSettings
 from services.simulation.data_alone import crossing_data_only
-from services.simulation.drawn import default_site, drive
+from services.simulation.drawn import drive
 from services.simulation.survey_kinds import KINDS
+from studies.simulation.truths import default_site
 from studies.validation.bound import at_truth
 from studies.validation.surveys import crossing_truth, site_of_truck
 

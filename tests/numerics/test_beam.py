@@ -21,7 +21,6 @@ from pre_core.physics.bridge import (
     modes,
     natural_frequencies_hz,
     refine,
-    static_deflection_m,
     stiffness_matrix,
     strain_energy_shares,
     uniform_beam,
@@ -35,6 +34,7 @@ from pre_core.physics.simulate import (
 )
 from pre_core.physics.vehicle import static_axle_loads_n
 from pre_core.search.levenberg_marquardt import sixth_order_jacobian
+from tests.numerics.statics import static_deflection_m
 
 FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]

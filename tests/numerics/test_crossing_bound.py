@@ -9,15 +9,9 @@ from pre_core.crossing import posterior
 from pre_core.survey.plan import PosteriorAtTruth
 from schemas.settings import IdentificationSettings
 from services.simulation.data_alone import crossing_data_only
-from services.simulation.drawn import (
-    IdentifiedCrossing,
-    SimulatedCrossing,
-    default_site,
-    draw_truth,
-    drive,
-    true_values,
-)
-from services.simulation.out_of_model import draw_out_of_model
+from services.simulation.drawn import IdentifiedCrossing, SimulatedCrossing, draw_truth, drive
+from studies.simulation.out_of_model import draw_out_of_model
+from studies.simulation.truths import default_site, true_values
 from studies.validation.bound import (
     at_truth,
     bound_at,

@@ -19,7 +19,6 @@ from pre_core.physics.bridge import (
     uniform_beam,
 )
 from pre_core.physics.march import march
-from pre_core.physics.newmark import newmark_modal
 from pre_core.physics.simulate import (
     Discretisation,
     WheelRoad,
@@ -28,6 +27,7 @@ from pre_core.physics.simulate import (
     simulate,
 )
 from pre_core.physics.vehicle import HalfCar
+from tests.numerics.newmark import newmark_modal
 
 FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]

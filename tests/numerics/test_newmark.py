@@ -15,7 +15,7 @@ from scipy.integrate import cumulative_trapezoid
 from pre_core.paper import experiment
 from pre_core.paper.integrate import newmark_integrate, spline_integrate
 from pre_core.physics.bridge import interpolation_matrix, mass_matrix, modes, stiffness_matrix
-from pre_core.physics.newmark import newmark, newmark_modal
+from tests.numerics.newmark import newmark, newmark_modal
 
 FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]

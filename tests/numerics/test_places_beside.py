@@ -4,7 +4,7 @@ import pytest
 
 from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
-from services.simulation.drawn import default_site
+from studies.simulation.truths import default_site
 from studies.validation.surveys import one_crossing
 
 

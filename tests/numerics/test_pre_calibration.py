@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pre_core.diagnostics import calibration
 from schemas.settings import IdentificationSettings
-from services.simulation.drawn import default_site
+from studies.simulation.truths import default_site
+from studies.validation import calibration_statistics as statistics
 from studies.validation.calibration import Record, in_processes, one_crossing, scores
 from studies.validation.uncertainty import HALF, JUDGED, judged_checks, one_judged, one_scenario
 
@@ -48,7 +48,7 @@ def test_a_dozen_crossings(lines: list[Record]) -> None:
     found = scores(drawn)
     assert found.seeds.size >= CROSSINGS - 1
     assert found.is_covered.mean() > 0.85
-    assert 0.75 < calibration.root_mean_square(found.z_log) < 1.4
+    assert 0.75 < statistics.root_mean_square(found.z_log) < 1.4
     assert found.std_log.mean() < 1.25 * found.bound.mean()
     assert np.abs(found.z_log[found.is_good]).max(initial=0.0) < 5.0
 

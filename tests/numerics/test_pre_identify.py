@@ -17,7 +17,6 @@ from pre_core.physics.simulate import CoupledResponse
 from schemas.results import CrossingResult, Results, results_json
 from schemas.settings import IdentificationSettings
 from services.drives.runs import Run
-from services.execution.offline import identify_recordings
 from services.simulation import drive as simulation
 from services.simulation.drive import (
     DrivenRoad,
@@ -30,6 +29,7 @@ from services.simulation.drive import (
     write_drive,
 )
 from services.simulation.wheel_paths import AxleRoads
+from tests.identifications import identify_recordings
 
 NOISE_UG = 25.0
 SEED = 3

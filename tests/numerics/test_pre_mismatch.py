@@ -21,7 +21,7 @@ from pre_core.crossing.noise import (
 )
 from pre_core.crossing.off_bridge import MIN_MISMATCH_STATISTIC
 from pre_core.crossing.rows import RESIDUALS, filter_rows, row_count, row_filter
-from pre_core.crossing.whitening import white_rows, whitener
+from pre_core.crossing.whitening import whitener
 from pre_core.physics.models import from_models
 from pre_core.physics.road import REFERENCE_CYCLES_PER_M
 from pre_core.physics.surface import (
@@ -34,6 +34,7 @@ from pre_core.physics.surface import (
 )
 from services.simulation.drive import beam_of, paper_site
 from services.simulation.drive import truck_of as car_of
+from tests.numerics.whitened import white_rows
 
 FloatArray = NDArray[np.float64]
 

@@ -29,12 +29,13 @@ from pre_core.crossing.rows import (
     row_filter,
 )
 from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_SPRING_N_PER_M
-from pre_core.crossing.whitening import Whitener, white_rows, whitener
+from pre_core.crossing.whitening import Whitener, whitener
 from pre_core.parameters import C_S1, K_S1, K_U1, M_U1
 from pre_core.physics.models import from_models
 from pre_core.physics.sensors import white_noise
 from pre_core.physics.vehicle import HalfCar, body_masses_kg
 from services.simulation.drive import beam_of, paper_site, truck_of
+from tests.numerics.whitened import white_rows
 
 FloatArray = NDArray[np.float64]
 
@@ -312,14 +313,6 @@ def test_factor_and_substitution_against_scipy() -> None:
     expected = solve_banded((width - 1, 0), lower, interleaved.T).T
     np.testing.assert_allclose(white, expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max())
     np.testing.assert_array_equal(white_rows(here.rows, noise, residuals[2]), white[2])
-
-
-def test_a_whitener_for_other_rows_is_refused() -> None:
-    here = case(1000.0, 1201)
-    with pytest.raises(ValueError, match="the whitener is"):
-        white_rows(here.rows, here.noise, np.zeros((3, 90)))
-    with pytest.raises(ValueError, match="the whitener is"):
-        white_rows(here.rows, here.noise, np.zeros((2, here.samples)))
 
 
 def test_densities_of_zero_are_refused() -> None:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pre_core.crossing import posterior
 from pre_core.crossing.compliances import to_compliance_coordinates
 from pre_core.crossing.rows import filter_adjoint, filter_rows, row_count, row_filter
-from pre_core.crossing.whitening import solve, solve_transposed, white_rows
+from pre_core.crossing.whitening import solve, solve_transposed
 from pre_core.fusion.information import BridgePriors, posterior_information
 from pre_core.fusion.joint import build_joint
 from pre_core.fusion.likelihood import CrossingLikelihood, likelihood
@@ -16,6 +16,7 @@ from pre_core.fusion.short_waves import ShortWaveResponse, shared_error_roots
 from pre_core.parameters import mass_powers, names
 from pre_core.physics.simulate import rear_position_m
 from tests.numerics.single_tyres import at_its_truth
+from tests.numerics.whitened import white_rows
 
 FloatArray = NDArray[np.float64]
 ELEMENTS = 5

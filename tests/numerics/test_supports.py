@@ -14,11 +14,11 @@ from pre_core.physics.bridge import (
     natural_frequencies_hz,
     node_dofs,
     refine,
-    static_deflection_m,
     stiffness_matrix,
     supported_nodes,
     uniform_beam,
 )
+from tests.numerics.statics import static_deflection_m
 
 FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]

@@ -11,11 +11,9 @@ from pre_core.physics.bridge import (
     interpolation_matrix,
     modes,
     refine,
-    static_deflection_m,
     uniform_beam,
 )
 from pre_core.physics.free_vibration import free_motion, free_vibration_after
-from pre_core.physics.newmark import newmark_modal
 from pre_core.physics.simulate import (
     Discretisation,
     InitialVibration,
@@ -24,6 +22,8 @@ from pre_core.physics.simulate import (
     deflection_m,
     simulate,
 )
+from tests.numerics.newmark import newmark_modal
+from tests.numerics.statics import static_deflection_m
 
 FloatArray = NDArray[np.float64]
 

@@ -41,7 +41,6 @@ from pre_core.parameters import (
 from pre_core.physics.surface import Footprint
 from pre_core.physics.tandem import NO_LEAD, Lead, friction_passage, shared_load
 from pre_core.physics.vehicle import masses_above_axles
-from services.simulation.tandem_cases import TandemOptions, draw_tandem
 from services.simulation.two_sided import WideTruck, axle_row, body_row, static_axle_loads_n
 from services.simulation.wide_crossings import (
     SatelliteErrors,
@@ -49,6 +48,7 @@ from services.simulation.wide_crossings import (
     WideDrivenRun,
     drive_case,
 )
+from studies.simulation.tandem_cases import TandemOptions, draw_tandem
 
 EXACT = SatelliteErrors(0.0, 0.0, 0.0)
 DENSITY = 25.0 * MICRO_G_M_PER_S2

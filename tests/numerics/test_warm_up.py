@@ -14,7 +14,8 @@ import gc, json, sys
 from pathlib import Path
 from numba.core.dispatcher import Dispatcher
 from schemas.settings import IdentificationSettings
-from services.execution.offline import identify_recordings, site_of
+from services.execution.offline import site_of
+from tests.identifications import identify_recordings
 from services.execution.warm_up import warm_up
 
 def compiled():

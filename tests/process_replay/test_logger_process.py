@@ -20,10 +20,11 @@ from schemas.signals import GnssFix, encode_gnss, encode_identity
 from schemas.topics import Message, selector
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
-from services.bus.subscription import RawSample, Subscription, get_latest
+from services.bus.subscription import RawSample, Subscription
 from services.recordings.recording import read_info, read_messages
 from services.recordings.writer import write_recording
 from tests.process_replay.starting import End, Start, start_logger
+from tests.receiving import get_latest
 from tests.waiting import LONGEST_S, until
 
 pytestmark = pytest.mark.process

@@ -15,9 +15,10 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.signals import decode_accel, decode_gnss
 from schemas.topics import Message, selector
 from services.bus.session import open_session
-from services.bus.subscription import RawSample, Subscription, get_latest
+from services.bus.subscription import RawSample, Subscription
 from services.recordings.recording import read_info, read_messages
 from tests.process_replay.starting import End, Start, start_logger
+from tests.receiving import get_latest
 from tests.waiting import LONGEST_S, until
 
 pytestmark = pytest.mark.process

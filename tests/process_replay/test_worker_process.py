@@ -21,7 +21,7 @@ from schemas.signals import Identity, decode_info, encode_info
 from schemas.topics import Message, selector
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
-from services.bus.subscription import RawSample, Subscription, get_latest
+from services.bus.subscription import RawSample, Subscription
 from services.common.errors import InputError
 from services.common.files import lock_folder
 from services.common.geodesy import bridge_frame, to_lat_lon
@@ -32,7 +32,7 @@ from services.simulation.drive import SimulatedDrive, paper_site
 from services.worker.run import run as run_worker
 from services.worker.settings import WorkerSettings
 from tests.builders.processes import stop
-from tests.receiving import several
+from tests.receiving import get_latest, several
 from tests.waiting import LONGEST_S
 
 pytestmark = pytest.mark.process

@@ -13,8 +13,9 @@ from scipy.special import ndtr
 from pre_core.constants import NORMAL_975
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
-from services.simulation.drawn import IdentifiedCrossing, default_site, draw_truth, drive
+from services.simulation.drawn import IdentifiedCrossing, draw_truth, drive
 from services.simulation.validation_options import IntervalOptions
+from studies.simulation.truths import default_site
 from studies.validation import calibration, run_intervals
 from studies.validation.calibration import (
     GROUPS,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from schemas.site import Bridge
-from services.simulation.drawn import default_site
 from services.simulation.survey_kinds import KINDS
+from studies.simulation.truths import default_site
 from studies.validation import detection
 from studies.validation.calibration import Record
 from studies.validation.detection import CrossingGroup, groups_of

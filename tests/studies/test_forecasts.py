@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from services.planning.crossings import axles_of, scale_error
-from services.simulation.drawn import default_site
 from services.simulation.survey_kinds import KINDS
+from studies.simulation.truths import default_site
 from studies.validation import forecasts
 from studies.validation.forecasts import forecasts_of
 from studies.validation.surveys import FusedSurvey

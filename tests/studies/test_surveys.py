@@ -7,8 +7,9 @@ import pytest
 
 from schemas.settings import IdentificationSettings
 from services.common.errors import InputError
-from services.simulation.drawn import default_site, draw_truth
+from services.simulation.drawn import draw_truth
 from services.simulation.survey_kinds import KINDS
+from studies.simulation.truths import default_site
 from studies.validation import surveys
 from studies.validation.calibration import Record
 from studies.validation.surveys import (

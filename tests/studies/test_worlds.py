@@ -15,15 +15,16 @@ from schemas.signals import CHANNELS
 from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_chainage
 from services.simulation import drawn as drawn_crossings
-from services.simulation import out_of_model
-from services.simulation.drawn import default_site, draw_truth
-from services.simulation.drive_wide import deck_with_width, truck_with_width
+from services.simulation.drawn import draw_truth
 from services.simulation.effects import ALONE, EVERYTHING, ON_SURFACES
-from services.simulation.out_of_model import OutOfModelTruth, draw_out_of_model
 from services.simulation.pavement import PLAIN
 from services.simulation.two_sided import static_axle_loads_n as static_loads
 from services.simulation.two_sided_deck import bending_frequencies_hz
 from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
+from studies.simulation import out_of_model
+from studies.simulation.drive_wide import deck_with_width, truck_with_width
+from studies.simulation.out_of_model import OutOfModelTruth, draw_out_of_model
+from studies.simulation.truths import default_site
 from studies.validation import worlds as validation
 from studies.validation.worlds import (
     append_record,
@@ -83,8 +84,8 @@ def test_an_effect_alone_changes_nothing_else(effect: str) -> None:
             "spans": bool(world.site.bridges[0].interior_supports_m),
             "surface": world.truth.paths is not None and world.truth.paths.pavement == PLAIN,
             "pavement": world.truth.paths is not None and world.truth.paths.pavement != PLAIN,
-            "torsion": world.truth.width is not None and world.truth.width.torsion is not None,
-            "left-and-right": world.truth.width is not None and bool(world.truth.width.sensors),
+            "torsion": world.width is not None and world.width.torsion is not None,
+            "left-and-right": world.width is not None and bool(world.width.sensors),
         }
         assert [name for name, there in others.items() if there] == [effect] * (effect != "free")
 
@@ -171,7 +172,7 @@ def test_on_a_surface_the_rear_axle_has_twin_tyres_and_runs_beside() -> None:
             SITE.vehicles[0], SurfaceOptions("twin", paths.rear.offset_m, 0.12)
         )
     assert {w.truth.conditions.road_class for w in drawn("surface")} == {"A", "B"}
-    assert all(w.truth.paths is None and w.truth.width is None for w in drawn(EVERYTHING))
+    assert all(w.truth.paths is None and w.width is None for w in drawn(EVERYTHING))
 
 
 def test_surface_tyres_default_to_the_site_file() -> None:
@@ -207,7 +208,7 @@ def test_the_surface_is_driven_over_by_the_worlds_truck(monkeypatch: pytest.Monk
 
 
 def test_torsion_and_sides_are_drawn_from_the_stated_ranges() -> None:
-    widths = [w.truth.width for w in drawn("torsion")]
+    widths = [w.width for w in drawn("torsion")]
     for world, width in zip(drawn("torsion"), widths, strict=True):
         assert width is not None
         assert width.torsion is not None
@@ -223,7 +224,7 @@ def test_torsion_and_sides_are_drawn_from_the_stated_ranges() -> None:
     ratios = frequencies / (0.5 * np.pi / 30.0**2 * np.sqrt(1.56e10 / np.array(masses)))
     assert within(ratios, out_of_model.TORSIONAL_RATIO)
     assert within([t.gyration_m for t in of_torsion], out_of_model.GYRATION_M)
-    pairs = [w.truth.width for w in drawn("left-and-right")]
+    pairs = [w.width for w in drawn("left-and-right")]
     assert within([width.load_left_m for width in pairs if width], out_of_model.LOAD_LEFT_M)
     for width in pairs:
         assert width is not None
@@ -263,7 +264,7 @@ def test_torsion_reaches_the_simulation_and_the_record(monkeypatch: pytest.Monke
 
 def test_truck_with_width_has_loads_and_inertia_of_the_half_car() -> None:
     world = draw_out_of_model(SITE, "torsion", 4)
-    width = world.truth.width
+    width = world.width
     assert width is not None
     car, beam = world.truth.car, world.truth.beam
     truck, deck = truck_with_width(car, width), deck_with_width(beam, width)
@@ -279,7 +280,7 @@ def test_truck_with_width_has_loads_and_inertia_of_the_half_car() -> None:
     np.testing.assert_allclose(
         bending_frequencies_hz(deck, 3), natural_frequencies_hz(refine(beam, 10), 3), rtol=1e-5
     )
-    leaning = draw_out_of_model(SITE, "left-and-right", 4).truth.width
+    leaning = draw_out_of_model(SITE, "left-and-right", 4).width
     assert leaning is not None
     assert truck_with_width(car, leaning).bodies[0].cg_left_m == leaning.load_left_m
     with pytest.raises(ValueError, match="one span of equal elements"):

@@ -24,9 +24,10 @@ from services.identification import fusing
 from services.identification.usable import Source, source_of
 from services.planning.alternatives import with_noise
 from services.planning.crossings import CrossingSimulator, PlannedCrossing, PlannedRoad, scale_error
-from services.simulation.drawn import default_site, identify_simulated
+from services.simulation.drawn import identify_simulated
 from services.simulation.drive import declared_site, simulate_drive
 from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
+from studies.simulation.truths import default_site
 
 WANDER_M = 0.12
 RATE_HZ = 1000.0

@@ -17,10 +17,11 @@ from schemas.site import Bridge, Site
 from schemas.site_file import load_site
 from services.drives.csv_import import read_folder
 from services.drives.runs import normalised
-from services.simulation.drawn import default_site, drive, identify_simulated
+from services.simulation.drawn import identify_simulated
 from services.simulation.drive import DrivenRoad, Measurement, simulate_drive
-from services.simulation.out_of_model import draw_out_of_model
 from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
+from studies.simulation.out_of_model import draw_out_of_model, drive_out_of_model
+from studies.simulation.truths import default_site
 from tests.verdicts.faults import errors_of
 
 LARGEST_Z, LARGEST_Z_OF_ENDS = 4.0, 3.0
@@ -37,7 +38,7 @@ def undeclared(site: Site) -> Site:
 def test_truck_with_equal_tyres_is_found_before_its_mismatch() -> None:
     """A mismatch that was estimated before the truck led to a rear tyre a thousand times softer."""
     world = draw_out_of_model(default_site(), "torsion", 0)
-    run = drive(world.site, world.truth, 0).run
+    run = drive_out_of_model(world, 0).run
     (found,) = identify_simulated([run], world.site, IdentificationSettings(threads=1))
     assert found.result.verdict == "good", found.result.reasons
     z = errors_of(found.result, world.truth.beam.flexural_rigidity_nm2)

@@ -6,8 +6,8 @@ import pytest
 from schemas.reasons import Reason
 from schemas.signals import CHANNELS
 from services.identification.checks import undeclared_axles
-from services.simulation.wide_cases import draw_wide, more_axles
 from services.simulation.wide_crossings import WideCase, drive_case, site_of
+from studies.simulation.wide_cases import draw_wide, more_axles
 
 
 def named(case: WideCase, *, is_doubted: bool) -> dict[Reason, str]:

@@ -9,7 +9,7 @@ import os
 import numpy as np
 import pytest
 
-from services.simulation.wide_cases import draw_wide, more_axles
+from studies.simulation.wide_cases import draw_wide, more_axles
 from tests.verdicts.width import Judged, judged
 
 WIDE, MORE_AXLES = 64, 16

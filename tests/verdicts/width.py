@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from schemas.settings import IdentificationSettings
 from services.simulation.drawn import identify_simulated
-from services.simulation.wide_cases import draw_wide, more_axles
 from services.simulation.wide_crossings import WideCase, drive_case, site_of
+from studies.simulation.wide_cases import draw_wide, more_axles
 
 
 class Judged(NamedTuple):

@@ -16,8 +16,6 @@ SPEED: Final = {
     "cm/s": 0.01, "mm/s": 0.001,
 }  # fmt: skip
 LENGTH: Final = {"m": 1.0, "ft": 0.3048, "cm": 0.01, "mm": 0.001}
-ANGLE: Final = ("deg", "1e-7 deg", "ddmm", "rad")
-TIME: Final = {"s": "s", "ms": "ms", "us": "us", "ns": "ns", "samples": "samples"}
 
 _SPELLINGS: Final = {
     "m/s2": "m/s2", "ms2": "m/s2", "ms-2": "m/s2", "mps2": "m/s2", "m/s/s": "m/s2",

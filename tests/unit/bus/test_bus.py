@@ -21,10 +21,10 @@ from services.bus.subscription import (
     RawSample,
     SeenSequences,
     Subscription,
-    get_latest,
     subscribe_latest,
 )
 from services.common.errors import FailureError, InputError
+from tests.receiving import get_latest
 from tests.slow_proxy import slow_proxy
 from tests.waiting import LONGEST_S, until
 

@@ -32,7 +32,7 @@ from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.importing import import_command
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.drives.settings import ImportOptions
-from services.execution.offline import identify_recordings, site_of
+from services.execution.offline import site_of
 from services.history.validation_files import save
 from services.recordings.recording import read_messages, read_site
 from services.recordings.writer import write_recording
@@ -44,6 +44,7 @@ from services.simulation.drive import (
     write_drive,
 )
 from tests.builders.certificates import certificate
+from tests.identifications import identify_recordings
 
 SOUND_NM2 = 1.56e10
 LEAST_SQUARES = IdentificationSettings(method="least_squares")

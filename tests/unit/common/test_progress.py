@@ -13,7 +13,7 @@ from services.common.progress import parts_bar, reading_bar, steps_bar
 from services.drives.importing import import_command
 from services.drives.settings import ImportOptions
 from services.drives.signals import signals_of_recording
-from services.execution.offline import identify_recordings, site_of
+from services.execution.offline import site_of
 from services.identification.bridge_state import RecentCrossings, add_crossings, state_of, usable
 from services.recordings.recovery import recover_recording
 from services.recordings.writer import write_recording
@@ -22,6 +22,7 @@ from services.report.page import page
 from services.report.pdf import write_pdf
 from services.viewer.pictures import write_pictures
 from services.viewer.view import convert
+from tests.identifications import identify_recordings
 from tests.unit.drives.recorded import drive
 from tests.unit.viewer.found import results_of, some_crossing
 

@@ -29,7 +29,7 @@ from services.execution.archive import (
 )
 from services.execution.dispatch import failed_result
 from services.execution.inline import InlineExecutor
-from services.execution.offline import identify_recordings, site_of
+from services.execution.offline import site_of
 from services.execution.result_store import ResultStore
 from services.finding import order as overview
 from services.finding.crossing_data import CrossingData
@@ -40,6 +40,7 @@ from services.recordings.recording import read_messages
 from services.recordings.remote import Recording, RemoteRecording, recording_at
 from services.recordings.writer import RecordingOrigin, RecordingWriter, write_recording
 from tests.drives import EXACT, drives
+from tests.identifications import identify_recordings
 
 LEAST_SQUARES = IdentificationSettings(method="least_squares")
 

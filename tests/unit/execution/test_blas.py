@@ -7,7 +7,8 @@ from pathlib import Path
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from schemas.settings import IdentificationSettings
-from services.execution.offline import identify_recordings, site_of
+from services.execution.offline import site_of
+from tests.identifications import identify_recordings
 
 
 def blas_threads() -> list[int]:

@@ -15,7 +15,7 @@ from services.identification.engine import Engine
 from services.identification.known import CrossingRecord, search_hash
 from services.identification.outputs import IdentificationTask, Output, ValidationRequest
 from services.identification.waiting import Validations
-from services.ledger.crossing_log import known_crossings
+from tests.builders.ledger import known_crossings
 from tests.identifications import Identifications
 from tests.unit.identification.test_engine_resume import (
     HEADER,

@@ -24,8 +24,8 @@ from services.identification.outputs import (
     Output,
     ValidationRequest,
 )
-from services.ledger.crossing_log import known_crossings
 from services.simulation.drive import paper_site
+from tests.builders.ledger import known_crossings
 from tests.identifications import Identifications
 from tests.working_engine import WorkingEngine
 

@@ -1,8 +1,8 @@
 """Priors of the axle ahead of a tandem."""
 
 from services.identification.footprints import displaced_leads_of, lead_of
-from services.simulation.drawn import default_site
 from services.simulation.usual_trucks import usual_tandem
+from studies.simulation.truths import default_site
 
 
 def test_each_value_of_the_front_axle_is_displaced_by_its_spread() -> None:

@@ -7,7 +7,7 @@ from services.finding.streams import Samples
 from services.identification.pre_method import inputs_of
 from services.identification.result_parts import beam_of, nominal_parameters
 from services.simulation.drive import paper_site
-from services.simulation.out_of_model import continuous
+from studies.simulation.out_of_model import continuous
 from tests.verdicts.steady import steady_crossing
 
 

@@ -12,11 +12,11 @@ from schemas.reasons import Reason
 from schemas.site import Vehicle
 from services.finding.placed import middle_names
 from services.identification.signal_checks import reasons_before_fit
-from services.simulation.drawn import default_site
 from services.simulation.drawn_tandem import TandemWorld, drawn_tandem
 from services.simulation.survey_kinds import KINDS
-from services.simulation.tandem_cases import draw_tandem
 from services.simulation.wide_crossings import drive_case, site_of
+from studies.simulation.tandem_cases import draw_tandem
+from studies.simulation.truths import default_site
 from studies.validation.surveys import crossing_truth, site_of_truck
 
 Floats = NDArray[np.float64]

@@ -12,10 +12,10 @@ from schemas.site_file import site_hash, site_toml
 from schemas.topics import Message
 from services.execution.inline import InlineExecutor
 from services.identification.known import search_hash
-from services.ledger.crossing_log import known_crossings
 from services.ledger.processed import is_processed
 from services.recordings.writer import write_recording
 from services.simulation.drive import paper_site
+from tests.builders.ledger import known_crossings
 from tests.identifications import Identifications
 from tests.unit.identification.test_engine_resume import messages_of
 from tests.working_engine import WorkingEngine

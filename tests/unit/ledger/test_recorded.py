@@ -13,7 +13,7 @@ from services.finding.stays import Passage
 from services.identification.engine import Engine
 from services.identification.outputs import IdentificationTask
 from services.ledger import recorded_crossings
-from services.ledger.crossing_log import Ledger, known_crossings
+from services.ledger.crossing_log import Ledger
 from services.ledger.recorded_crossings import (
     FetchResult,
     RecordedStay,
@@ -21,6 +21,7 @@ from services.ledger.recorded_crossings import (
     scan_stays,
 )
 from services.recordings.writer import write_recording
+from tests.builders.ledger import known_crossings
 from tests.unit.identification.test_engine_resume import (
     HEADER,
     REALM,

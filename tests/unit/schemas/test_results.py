@@ -31,7 +31,6 @@ from schemas.results import (
 from schemas.results_on_the_wire import (
     bridge_to_protobuf,
     crossing_to_protobuf,
-    direction_from_protobuf,
     estimate_to_crossing,
     state_to_bridge,
 )
@@ -309,8 +308,6 @@ def test_malformed_messages_are_refused_with_one_line() -> None:
         with pytest.raises(ValueError, match=words) as caught:
             estimate_to_crossing(wrong)
         assert len(str(caught.value).splitlines()) == 1
-    with pytest.raises(ValueError, match="direction"):
-        direction_from_protobuf(pb.DIRECTION_UNSPECIFIED)
 
 
 def test_matrix_and_profiles_must_have_the_right_size() -> None:

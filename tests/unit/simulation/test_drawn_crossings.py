@@ -5,14 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pre_core import parameters
-from services.simulation.drawn import (
-    CrossingTruth,
-    _motion,
-    default_site,
-    draw_truth,
-    drive,
-    true_values,
-)
+from services.simulation.drawn import CrossingTruth, draw_truth, drive, motion_of
+from studies.simulation.truths import default_site, true_values
 
 SEEDS = range(600)
 SITE = default_site()
@@ -119,7 +113,7 @@ def test_motion_enters_the_bridge_at_its_moment_and_is_smooth(forward: bool) -> 
     )
     truth = truth._replace(conditions=how)
     bridge, step_s = SITE.bridges[0], 1e-3
-    motion = _motion(truth, bridge, step_s, 1)
+    motion = motion_of(truth, bridge, step_s, 1)
     sign = 1.0 if forward else -1.0
     near = 0.0 if forward else bridge.span_m
     entry = np.argmin(np.abs(motion.position_m - near))

@@ -12,7 +12,7 @@ from schemas.site import Site
 from schemas.site_file import parse_site, site_toml
 from services.cli import main as cli
 from services.common.errors import InputError
-from services.execution.offline import identify_recordings, site_of
+from services.execution.offline import site_of
 from services.simulation.command import effects_of, simulate_command
 from services.simulation.drive import (
     DepartedVehicle,
@@ -27,10 +27,11 @@ from services.simulation.drive import (
     with_effects,
     write_drive,
 )
-from services.simulation.out_of_model import continuous
 from services.simulation.settings import SimulateOptions
 from services.viewer.crossing_view import view_of_crossing
 from studies.paper.scenarios import models
+from studies.simulation.out_of_model import continuous
+from tests.identifications import identify_recordings
 
 BEFORE_S = 3.0
 

@@ -12,16 +12,17 @@ from schemas.site import Site
 from schemas.site_file import parse_site
 from services.cli.main import main
 from services.common.geodesy import bridge_frame, to_chainage
-from services.execution.offline import identify_recordings, site_of
+from services.execution.offline import site_of
 from services.finding.placed import middle_site
 from services.simulation.drawn import draw_truth, drive
 from services.simulation.drawn_tandem import TandemWorld, drawn_tandem, drawn_vehicle
 from services.simulation.drive_tandem import TandemDrive, tandem_case
-from services.simulation.tandem_cases import draw_tandem
 from services.simulation.two_sided import static_axle_loads_n
 from services.simulation.usual_trucks import usual_tandem
 from services.simulation.wheel_paths import SurfaceOptions
 from services.simulation.wide_crossings import drive_case, site_text
+from studies.simulation.tandem_cases import draw_tandem
+from tests.identifications import identify_recordings
 
 TEXT = site_text(draw_tandem(12))
 SITE: Site = parse_site(TEXT, "site.toml")

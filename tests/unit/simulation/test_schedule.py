@@ -10,8 +10,8 @@ from services.catalogue.contents import summarise_recording
 from services.cli.main import main
 from services.simulation.drive import paper_site
 from services.simulation.schedule import Schedule
-from services.simulation.tandem_cases import draw_tandem
 from services.simulation.wide_crossings import site_text
+from studies.simulation.tandem_cases import draw_tandem
 
 
 @pytest.mark.parametrize("has_tandem", [False, True])

@@ -13,7 +13,6 @@ from services.common.errors import FailureError
 from services.simulation import validation_trial as under_test
 from services.simulation.drawn import CrossingTruth, SimulatedCrossing, drive
 from services.simulation.drive import paper_site
-from services.simulation.out_of_model import WANDER_M
 from services.simulation.validation_trial import (
     CROSSINGS,
     FEWEST,
@@ -25,6 +24,7 @@ from services.simulation.validation_trial import (
     run_trial,
     single_pair_site,
 )
+from services.simulation.wheel_paths import WANDER_M
 
 SITE = paper_site()
 PAIR = VehicleBridgePair("truck-1", "bridge-1")

@@ -1,39 +1,31 @@
-"""Crossings with width: what sensors and receivers record, what is drawn, and the files."""
-
-import json
-from pathlib import Path
+"""Crossings with width: what sensors and receivers record, and what is drawn."""
 
 import numpy as np
 import pytest
 
-from schemas.site import Bridge
-from schemas.site_file import load_site
+from schemas.signals import CHANNELS
 from services.common.geodesy import bridge_frame, to_chainage
-from services.drives.csv_import import read_folder
-from services.simulation import wide_cases
 from services.simulation.two_sided import static_axle_loads_n
 from services.simulation.two_sided_deck import bending_frequencies_hz
-from services.simulation.wide_cases import (
-    draw_wide,
-    middle_sensors,
-    more_axles,
-    tandem_truck,
-)
 from services.simulation.wide_crossings import (
-    PAIR_NAMES,
-    RTK,
     SatelliteErrors,
     WideCase,
     WideDrivenRun,
     WideSensor,
     drive_case,
-    middle_channels,
     site_of,
-    site_text,
-    write_folder,
+)
+from studies.simulation import wide_cases
+from studies.simulation.drive_wide import middle_channels
+from studies.simulation.wide_cases import (
+    draw_wide,
+    middle_sensors,
+    more_axles,
+    tandem_truck,
 )
 
 GRAVITY = 9.80665
+RTK = SatelliteErrors(0.02, 0.02, 0.02)
 QUIET = SatelliteErrors(0.0, 0.0, 0.0)
 
 
@@ -51,12 +43,10 @@ def driven() -> WideDrivenRun:
 
 def test_same_case_gives_the_same_run(driven: WideDrivenRun) -> None:
     again = drive_case(short(draw_wide(1)), 0)
-    for name in PAIR_NAMES:
+    for name in CHANNELS:
         np.testing.assert_array_equal(again.run.channels[name], driven.run.channels[name])
     other = drive_case(short(draw_wide(1))._replace(road_seed=7), 0)
-    assert (
-        np.abs(other.run.channels[PAIR_NAMES[2]] - driven.run.channels[PAIR_NAMES[2]]).max() > 0.5
-    )
+    assert np.abs(other.run.channels[CHANNELS[2]] - driven.run.channels[CHANNELS[2]]).max() > 0.5
 
 
 def test_recording_has_road_before_and_behind_the_bridge(driven: WideDrivenRun) -> None:
@@ -135,8 +125,8 @@ def test_mean_of_left_and_right_is_the_middle(driven: WideDrivenRun) -> None:
     )
     read = drive_case(case._replace(sensors=pairs), 0).run.channels
     middle = middle_channels(read, pairs)
-    assert tuple(middle) == PAIR_NAMES
-    for name in PAIR_NAMES:
+    assert tuple(middle) == CHANNELS
+    for name in CHANNELS:
         np.testing.assert_allclose(middle[name], driven.run.channels[name], atol=1e-9)
     # There is roll to be averaged away.
     assert np.abs(read["axle-0.0-1-1.0"] - middle["unsprung_front"]).max() > 0.5
@@ -144,26 +134,10 @@ def test_mean_of_left_and_right_is_the_middle(driven: WideDrivenRun) -> None:
         middle_channels(read, (pairs[0], *pairs[2:]))
 
 
-def test_folder_reads_as_a_shared_crossing(tmp_path: Path) -> None:
-    case = draw_wide(4, declared=True, tyres="single", runs=2)
-    folder = tmp_path / "w4"
-    write_folder(folder, case)
-    first, second = read_folder(folder)
-    assert second.accel_time_s[0] - first.accel_time_s[0] == pytest.approx(600.0)
-    np.testing.assert_allclose(
-        first.channels["sprung_rear"], drive_case(case, 0).run.channels["sprung_rear"], atol=1e-5
-    )
-    truth = json.loads((folder / "truth.json").read_text())
-    assert truth["EI"] == list(case.deck.flexural_rigidity_nm2)
-    assert len(truth["runs"]) == 2
-    assert truth["runs"][0]["entry"] > truth["runs"][0]["t0"]
-    text = (folder / "site.toml").read_text()
-    assert "lane_offset_m" in text
-    assert "lane_offset_m" not in site_text(case, with_width=False)
-    if "lane_offset_m" in Bridge.model_fields:
-        load_site(folder / "site.toml")
-    with pytest.raises(FileExistsError):
-        write_folder(folder, case)
+def test_runs_of_a_case_are_ten_minutes_apart() -> None:
+    case = short(draw_wide(4, runs=2))
+    first, second = (drive_case(case, number).run.accel_time_s for number in range(2))
+    assert second[0] - first[0] == pytest.approx(600.0)
 
 
 def test_drawn_cases_have_the_stated_ranges() -> None:
@@ -203,7 +177,7 @@ def test_cases_of_more_axles_are_declared_as_two() -> None:
     for case in cases:
         assert len(case.truck.axles) > 2
         site = site_of(case)
-        assert {sensor.channel for sensor in case.sensors} == set(PAIR_NAMES)
+        assert {sensor.channel for sensor in case.sensors} == set(CHANNELS)
         assert site.vehicles[0].wheelbase_m < max(axle.position_m for axle in case.truck.axles)
     assert {len(case.truck.axles) for case in cases} == {3, 5}
     assert {case.is_one_road for case in cases} == {True, False}

@@ -11,11 +11,12 @@ from pre_core.crossing.fitted_residuals import AFTER, BEFORE, ON, FittedResidual
 from pre_core.diagnostics import quality
 from schemas.results import Results
 from schemas.settings import IdentificationSettings
-from services.execution.offline import identify_recordings, site_of
+from services.execution.offline import site_of
 from services.recordings.recording import read_messages
 from services.viewer.panels.residuals import band_names
 from services.viewer.rerun_file import RerunContent, write_rrd
 from services.viewer.residuals import _by_band, residual_cells
+from tests.identifications import identify_recordings
 
 Cells = dict[tuple[int, int, int], quality.ResidualBin]
 

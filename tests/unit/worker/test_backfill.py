@@ -20,10 +20,11 @@ from services.execution.processes import BackgroundResult, BackgroundTask, Proce
 from services.identification.engine import Engine
 from services.identification.known import search_hash
 from services.identification.waiting import Validations
-from services.ledger.crossing_log import Ledger, known_crossings
+from services.ledger.crossing_log import Ledger
 from services.recordings.writer import RecordingOrigin, RecordingWriter
 from services.worker.backfill import Backfill
 from services.worker.recording_list import BackfillSource
+from tests.builders.ledger import known_crossings
 from tests.identifications import Identifications
 from tests.unit.identification.test_engine_resume import (
     HEADER,

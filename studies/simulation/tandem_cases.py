@@ -10,17 +10,17 @@ import numpy as np
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from services.simulation.two_sided import WideAxle, WideBogie, WideTruck, static_axle_loads_n
-from services.simulation.wide_cases import (
+from services.simulation.wheel_paths import WANDER_M
+from services.simulation.wide_crossings import WideCase, WideRun, WideSensor
+from studies.simulation.wide_cases import (
     SINGLE,
     TWIN,
-    WANDER_M,
     declared_bridge,
     disturbed,
     draw_beam,
     rigid_body,
     with_errors,
 )
-from services.simulation.wide_crossings import WideCase, WideRun, WideSensor
 
 TOTAL_MASS_KG: Final = (17e3, 26e3)
 AHEAD_M: Final = (3.6, 5.0)

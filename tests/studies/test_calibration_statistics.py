@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chisquare, kstest, lognorm, norm, truncnorm
 
 from pre_core.constants import NORMAL_975
-from pre_core.diagnostics.calibration import (
+from studies.validation.calibration_statistics import (
     bonferroni_p_value,
     pooled_share,
     rank,

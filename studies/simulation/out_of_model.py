@@ -41,9 +41,8 @@ from pre_core.physics.bridge import Beam, natural_frequencies_hz
 from pre_core.physics.vehicle import HalfCar
 from schemas.site import Bridge, Site
 from services.common.geodesy import bridge_frame, to_lat_lon
-from services.simulation.drawn import CrossingTruth, draw_truth
+from services.simulation.drawn import CrossingTruth, SimulatedCrossing, draw_truth, drive
 from services.simulation.drive import DepartedVehicle, OutOfModelEffects, with_effects
-from services.simulation.drive_wide import Width
 from services.simulation.effects import (
     AMONG_ALL,
     EFFECTS,
@@ -55,8 +54,9 @@ from services.simulation.effects import (
 )
 from services.simulation.pavement import PLAIN, Pavement
 from services.simulation.two_sided_deck import Torsion
-from services.simulation.wheel_paths import SurfaceOptions, WheelPaths, wheel_paths_of
+from services.simulation.wheel_paths import WANDER_M, SurfaceOptions, WheelPaths, wheel_paths_of
 from services.simulation.wide_crossings import WideSensor
+from studies.simulation.drive_wide import Width, drive_wide
 
 Floats = NDArray[np.float64]
 
@@ -74,7 +74,6 @@ AIR_EXPONENT = (1.2, 1.4)
 SPANS = (2, 5)
 SPAN_M = (12.0, 25.0)
 REAR_OFFSET_M = (0.0, 0.01)
-WANDER_M = 0.12
 LANE_OFFSET_M = (0.5, 2.0)
 TORSIONAL_RATIO = (1.3, 3.0)
 GYRATION_M = (1.8, 3.0)
@@ -93,6 +92,8 @@ class OutOfModelTruth(NamedTuple):
     site: Site
     """Nominal values except noise; for continuous bridges, with the supports."""
     beyond: OutOfModelEffects
+    width: Width | None
+    """Properties of truck and bridge beyond the plane; None: none."""
 
 
 class _LateralDraws(NamedTuple):
@@ -162,10 +163,15 @@ def draw_out_of_model(site: Site, effect: str, seed: int) -> OutOfModelTruth:
         width = _twisting(_paths(site, rear_offset, PLAIN), lateral, site, beam)
     if has(LEFT_AND_RIGHT):
         width = _leaning(_paths(site, rear_offset, PLAIN), lateral, site, drawn, car)
-    truth = drawn._replace(
-        car=car, beam=beam, conditions=conditions, left=beyond.left, paths=paths, width=width
-    )
-    return OutOfModelTruth(truth, site, beyond)
+    truth = drawn._replace(car=car, beam=beam, conditions=conditions, left=beyond.left, paths=paths)
+    return OutOfModelTruth(truth, site, beyond, width)
+
+
+def drive_out_of_model(world: OutOfModelTruth, seed: int) -> SimulatedCrossing:
+    """Simulate and measure one crossing; `seed` is that of noise and receiver."""
+    if world.width is None:
+        return drive(world.site, world.truth, seed)
+    return drive_wide(world.site, world.truth, world.width, seed)
 
 
 def _draw_departed(rng: np.random.Generator) -> DepartedVehicle:

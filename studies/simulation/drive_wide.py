@@ -4,7 +4,7 @@
 Sensors on the centre line, or left and right, become the four channels of every method.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,11 +13,19 @@ from numpy.typing import NDArray
 from pre_core.physics.bridge import Beam
 from pre_core.physics.road import Profile
 from pre_core.physics.sensors import Accelerometer, measure_acceleration
+from pre_core.physics.simulate import Motion
 from pre_core.physics.surface import Footprint
 from pre_core.physics.vehicle import HalfCar
 from schemas.signals import CHANNELS
-from schemas.site import Bridge
+from schemas.site import Bridge, Site
 from services.drives.runs import Run
+from services.simulation.drawn import (
+    CrossingTruth,
+    SimulatedCrossing,
+    instruments_of,
+    motion_of,
+)
+from services.simulation.drive import SETTLE_S, declared_site
 from services.simulation.positions import (
     START_TIME_S,
     AntennaTrack,
@@ -29,7 +37,7 @@ from services.simulation.two_sided import Body, WideAxle, WideMotion, WideRoad, 
 from services.simulation.two_sided_deck import Deck, Torsion
 from services.simulation.two_sided_surface import draw_waves
 from services.simulation.wheel_paths import WheelPaths
-from services.simulation.wide_crossings import WideSensor, middle_channels, road_under, sensor_row
+from services.simulation.wide_crossings import WideSensor, road_under, sensor_row
 
 Floats = NDArray[np.float64]
 
@@ -53,7 +61,7 @@ class Width(NamedTuple):
     """Sensors with gains, delays and biases; empty: the four on the centre line."""
 
 
-class WideDrive(NamedTuple):
+class _WideDrive(NamedTuple):
     """The recording of a truck, and the truth."""
 
     run: Run
@@ -63,7 +71,37 @@ class WideDrive(NamedTuple):
     """Largest deflection of the bridge's axis under an axle."""
 
 
-def measured_wide_run(
+def drive_wide(site: Site, truth: CrossingTruth, width: Width, seed: int) -> SimulatedCrossing:
+    """Simulate and measure one crossing of a truck and a bridge with width, as `drawn.drive`."""
+    bridge, how = site.bridges[0], truth.conditions
+    every = max(1, int(np.ceil(1.0 / (how.rate_hz * LONGEST_STEP_S))))
+    step_s = 1.0 / (how.rate_hz * every)
+    settling = round(SETTLE_S * how.rate_hz) * every
+    densities = how.densities_ug_per_rthz
+    halves = motion_of(truth, bridge, 0.5 * step_s, 2 * every)
+    wide = _measured_wide_run(
+        bridge,
+        truth.car,
+        truth.beam,
+        width,
+        TimedMotion(halves, step_s, settling),
+        (how.road_class, how.road_seed),
+        instruments_of(site, truth, densities, seed),
+    )
+    of_channels = np.array(densities) / (np.sqrt(2.0) if width.sensors else 1.0)
+    return SimulatedCrossing(
+        truth,
+        wide.run,
+        declared_site(site, tuple(of_channels.tolist()), how.rate_hz),
+        Motion(*(values[::2] for values in halves)),
+        float(wide.run.accel_time_s[0]) - settling * step_s,
+        step_s,
+        wide.road,
+        wide.largest_deflection_m,
+    )
+
+
+def _measured_wide_run(
     bridge: Bridge,
     car: HalfCar,
     beam: Beam,
@@ -71,7 +109,7 @@ def measured_wide_run(
     driven: TimedMotion,
     road: tuple[str, int],
     instruments: Instruments,
-) -> WideDrive:
+) -> _WideDrive:
     """Drive a truck with width along a motion, given every half step, and measure it.
 
     The sensors are those of the four channels; further sensors of the truck have the rate of the
@@ -122,7 +160,7 @@ def measured_wide_run(
     rate = instruments.sensors[0].rate_hz
     time_s = START_TIME_S + np.arange(channels[CHANNELS[0]].size, dtype=np.float64) / rate
     run = Run("simulation", time_s, rate, channels, gnss)
-    return WideDrive(run, _felt_in_front(surface, truck), -float(response.deflection_m.min()))
+    return _WideDrive(run, _felt_in_front(surface, truck), -float(response.deflection_m.min()))
 
 
 def _places(
@@ -149,6 +187,26 @@ def _places(
         )
         for place in width.sensors
     ]
+
+
+def middle_channels(
+    channels: Mapping[str, Floats], sensors: Sequence[WideSensor]
+) -> dict[str, Floats]:
+    """Average sensors left and right of the same place into the four centre channels.
+
+    Body places and axles are front and rear in their order. Raise ValueError where sensors of one
+    place have no mean on the centre line.
+    """
+    found: dict[str, Floats] = {}
+    for on, names in (("body", CHANNELS[:2]), ("axle", CHANNELS[2:])):
+        of = [sensor for sensor in sensors if sensor.on == on]
+        places = sorted({(sensor.axle, sensor.position_m) for sensor in of})
+        for name, place in zip(names, places, strict=True):
+            there = [sensor for sensor in of if (sensor.axle, sensor.position_m) == place]
+            if abs(sum(sensor.lateral_m for sensor in there)) > 1e-9:
+                raise ValueError(f"{there[0].channel} and what is with it are not symmetric")
+            found[name] = np.mean([channels[sensor.channel] for sensor in there], axis=0)
+    return found
 
 
 def _felt_in_front(road: WideRoad, truck: WideTruck) -> Profile:

@@ -21,6 +21,7 @@ from services.simulation.two_sided import (
     static_axle_loads_n,
 )
 from services.simulation.two_sided_deck import Deck, Torsion, bending_frequencies_hz
+from services.simulation.wheel_paths import WANDER_M
 from services.simulation.wide_crossings import (
     USUAL_RECEIVER,
     SatelliteErrors,
@@ -48,7 +49,6 @@ TORSIONAL_RATIO: Final = (1.3, 3.0)
 GYRATION_M: Final = (1.8, 3.0)
 WEAK: Final = (0.4, 0.75)
 """EI of the weak element over that of the others, where there is one."""
-WANDER_M: Final = 0.12
 REAR_OFFSET_M: Final = 0.005
 SINGLE: Final[Mapping[str, Any]] = {"track_m": 1.9, "tyre_width_m": 0.25}
 TWIN: Final[Mapping[str, Any]] = {"track_m": 1.83, "tyre_width_m": 0.22, "twin_distance_m": 0.33}

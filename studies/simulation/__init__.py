@@ -1,0 +1,1 @@
+"""Drawn crossings beyond the physics of the method, simulated by `services.simulation`."""
