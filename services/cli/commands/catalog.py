@@ -30,7 +30,7 @@ class CatalogOptions:
     )
     site: Path | None = site_option("list crossings of its bridges, from positions alone")
     csv: Path | None = output_option(
-        "CSV file of all crossings (with --site) or recordings",
+        "CSV file of all crossings (with --site) or recordings; times are Unix times in s",
         "OUT.csv",
         CATALOG_CSV,
         CROSSINGS_CSV,
