@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from schemas.results import Results, load_results, results_json
 from services.cli.bridge_table import print_bridge
 from services.cli.commands.fuse import FuseOptions
+from services.cli.identify import warn_of_shared_crossings
 from services.common.errors import InputError
 from services.common.files import check_writable, write_atomically
 from services.common.progress import Steps, parts_bar, steps_bar
@@ -46,6 +47,8 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
         if number > 0:
             console.print()
         print_bridge(console, elements, fused.results.bridges[name])
+    if stored is not None:
+        warn_of_shared_crossings(fused.results.bridges, stored[1].bridges)
     if json_path is not None:
         write_atomically(json_path, results_json(fused.results))
     return 0

@@ -40,6 +40,7 @@ from services.finding.order import index_messages
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
 from services.history.validation_files import passed_validations
 from services.identification.bridge_state import Fusing
+from services.identification.comparison import baseline_cautions
 from services.identification.methods import lacks_noise
 from services.ledger.baselines import baselines_of
 from services.recordings.recording import read_messages
@@ -72,6 +73,7 @@ def identify_command(
         draws: dict[str, Draws] = {}
         found = _found(request, draws, executing, console)
         _print(console, found, known)
+        warn_of_shared_crossings(found.bridges, request.fusing.baselines)
         if asked.json is not None:
             write_atomically(asked.json, results_json(found))
         if asked.rrd is not None:
@@ -176,6 +178,14 @@ def warn_of_no_noise(site: Site, method: str) -> None:
             "the site declares sensors without noise, which method pre cannot use; "
             "simulations without noise are for --method least-squares"
         )
+
+
+def warn_of_shared_crossings(
+    states: Mapping[str, BridgeResult], baselines: Mapping[str, BridgeResult]
+) -> None:
+    """Warn where a bridge is compared with a baseline of the same crossings."""
+    for line in baseline_cautions(states, baselines):
+        _log.warning("%s", line)
 
 
 def _write_rerun(

@@ -13,7 +13,7 @@ from schemas.site_file import load_site, parse_site
 from services.catalogue.index import update_catalog
 from services.catalogue.positions import crossings_of
 from services.cli.bridge_table import print_bridge
-from services.cli.identify import check_certificates, warn_of_no_noise
+from services.cli.identify import check_certificates, warn_of_no_noise, warn_of_shared_crossings
 from services.cli.parsing import EXIT_SOMETHING_LOST
 from services.cli.settings import IdentifyOptions
 from services.common.errors import InputError
@@ -96,6 +96,7 @@ def archive_command(
             on_result=crossings.append if json_path is not None else lambda crossing: None,
             report=lambda number: bar.update(task, description=count_of(number, "crossing")),
         )
+    warn_of_shared_crossings(found.bridges, asked.fusing.baselines)
     header = asked.header
     _write(into / BRIDGES, header, [], found)
     if json_path is not None:

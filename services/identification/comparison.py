@@ -7,7 +7,7 @@ is used, to make elements of different design comparable.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -26,6 +26,28 @@ IMPLAUSIBLE_GAIN = 0.2
 30 K, the stiffness of concrete and asphalt rises by some 12 %."""
 _FEWEST_ELEMENTS = 3
 """Fewest elements: of two the undamaged one cannot be identified."""
+
+
+def shared_crossings(used: Set[str], before: Set[str], language: Language = ENGLISH) -> str | None:
+    """Return a caution if crossings of a measurement are in its baseline, too; None without any."""
+    common = used & before
+    if not common:
+        return None
+    if common == used == before:
+        return language.text("caution.same.all")
+    return language.choice("caution.same", len(common))
+
+
+def baseline_cautions(
+    states: Mapping[str, BridgeResult], baselines: Mapping[str, BridgeResult]
+) -> Iterator[str]:
+    """Yield a line for each bridge that is compared with crossings of its own, by its name."""
+    for name, state in states.items():
+        if name in baselines:
+            before = frozenset(baselines[name].crossings_used)
+            caution = shared_crossings(frozenset(state.crossings_used), before)
+            if caution is not None:
+                yield f"{name}: {caution}"
 
 
 class Estimate(NamedTuple):

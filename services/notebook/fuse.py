@@ -1,5 +1,6 @@
 """Fusion of the crossings of several results, as by `driveby fuse`."""
 
+import warnings
 from collections.abc import Iterable, Sequence
 from html import escape
 from os import PathLike
@@ -14,6 +15,7 @@ from services.common.files import check_writable, write_atomically
 from services.common.kinds import RESULTS
 from services.execution.blas import one_blas_thread
 from services.execution.fuse_results import FusedElements, crossings_to_fuse, fuse_crossings
+from services.identification.comparison import baseline_cautions
 from services.notebook.arguments import path_of
 from services.notebook.read import Name, given_site
 from services.notebook.showing import RIGIDITY_HEAD, html_table, rigidity_cells
@@ -114,6 +116,9 @@ def fuse(
             lambda bridge, stage, share: None,
             fuse_suspect=fuse_suspect,
         )
+    if stored is not None:
+        for line in baseline_cautions(fused.results.bridges, stored[1].bridges):
+            warnings.warn(line, stacklevel=2)
     known = _newest_site(sources) if site is None else given_site(site)
     return Fusion(fused.results, fused.bridges, known, None if stored is None else stored[1])
 

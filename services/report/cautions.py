@@ -17,6 +17,7 @@ from services.identification.comparison import (
     Comparison,
     Element,
     compare,
+    shared_crossings,
 )
 from services.report.earlier import Before, Combined, days_between, season_of
 from services.report.place import ends_of
@@ -89,14 +90,11 @@ def named_elements(numbers: Sequence[int], language: Language) -> str:
 
 def _same_crossings(measured: Measured, language: Language) -> Iterator[str]:
     """Yield how many crossings the baseline shares with the measurement compared with it."""
-    used = measured.view.used
-    common = used if measured.before is None else used & measured.before.used
-    if measured.before is None or not common:
+    if measured.before is None:
         return
-    if common == used == measured.before.used:
-        yield language.text("caution.same.all")
-    else:
-        yield language.choice("caution.same", len(common))
+    caution = shared_crossings(measured.view.used, measured.before.used, language)
+    if caution is not None:
+        yield caution
 
 
 def _implausible(comparison: Comparison, language: Language) -> Iterator[str]:

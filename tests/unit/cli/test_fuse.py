@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+import driveby
 from services.cli.main import main
 from tests.unit.identification.test_fusing import crossing, write
 
@@ -53,3 +54,31 @@ def test_combined_days_name_the_commands_that_show_a_change(
         assert main(["fuse", str(path)]) == 0
         out = " ".join(capsys.readouterr().out.split())
         assert ("whether EI changed between them: driveby history" in out) is is_said
+
+
+@pytest.mark.parametrize(
+    ("numbers", "line"),
+    [
+        ((0, 1), "bridge-1: The baseline has the same crossings: a measurement is compared with"),
+        ((1, 2), "bridge-1: One of these crossings is in the baseline, too: a change is under"),
+        ((2, 3), None),
+    ],
+)
+def test_baseline_of_the_same_crossings_is_a_warning(
+    numbers: tuple[int, ...],
+    line: str | None,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    recwarn: pytest.WarningsRecorder,
+) -> None:
+    before = tmp_path / "before.json"
+    first = write(tmp_path / "first.json", [crossing(0), crossing(1)])
+    assert main(["fuse", str(first), "--json", str(before)]) == 0
+    now = write(tmp_path / "now.json", [crossing(number) for number in numbers])
+    capsys.readouterr()
+    assert main(["fuse", str(now), "--baseline", str(before)]) == 0
+    error = capsys.readouterr().err
+    assert (line is None and not error) or (line is not None and line in " ".join(error.split()))
+    driveby.fuse(now, baseline=before)
+    warned = [str(one.message) for one in recwarn if one.category is UserWarning]
+    assert [one[: len(line or "")] for one in warned] == ([] if line is None else [line])
