@@ -11,8 +11,8 @@ from services.common.files import check_writable, write_atomically
 from services.common.kinds import HTML
 from services.common.language import LANGUAGES, language_of
 from services.ledger.site_of_results import site_of_results
-from services.notebook.arguments import path_of
-from services.notebook.fuse import RESULTS_EXPECTED, Fusion
+from services.notebook.arguments import known_arguments, path_of
+from services.notebook.fuse import RESULTS_EXPECTED, Fusion, check_identifiers
 from services.notebook.read import Name, given_site
 from services.notebook.solution import Identification
 from services.report.bridge import bridge_reports
@@ -21,6 +21,7 @@ from services.report.page import page
 _BASELINE: Final = "the name of a results file"
 
 
+@known_arguments()
 def report(
     *sources: Name | Identification | Fusion,
     output: Name = "report.html",
@@ -32,7 +33,8 @@ def report(
 
     `baseline` is an earlier results file, whose numbers stand next to these; `language` is `en` or
     `de`. `site` is needed where the folder of a results file has no recording. Return the path.
-    Raise InputError, in one line, for results that cannot be reported.
+    Raise InputError, in one line, for results that cannot be reported, or crossings in memory that
+    differ and have one identifier.
     """
     path = path_of("output", output, "the name of an HTML file (.html)")
     if path.suffix not in (".html", ".htm"):
@@ -44,6 +46,9 @@ def report(
     check_writable(path, kinds=(HTML,))
     given = None if site is None else given_site(site)
     files = [_file(source, given) for source in sources]
+    check_identifiers(
+        [source.results for source in sources if isinstance(source, Identification | Fusion)]
+    )
     beside = Path(site).parent if isinstance(site, str | PathLike) else None
     before = None if baseline is None else path_of("baseline", baseline, _BASELINE)
     words = language_of(language)

@@ -9,7 +9,7 @@ from schemas.site import Site
 from services.common.errors import InputError
 from services.common.field_docs import with_field_docs
 from services.execution.blas import one_blas_thread
-from services.notebook.arguments import number, one_or_two, whole
+from services.notebook.arguments import known_arguments, number, one_or_two, whole
 from services.notebook.read import Name, given_site
 from services.planning.forecast_text import as_json, lines_of
 from services.planning.plan_survey import SurveyWishes, plan_survey
@@ -32,6 +32,7 @@ class SurveyPlan(NamedTuple):
         return as_json(self.survey)
 
 
+@known_arguments()
 def survey(
     site: Name | Site,
     *,

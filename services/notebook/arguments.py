@@ -1,18 +1,50 @@
 """Checks of arguments: a wrong one is an InputError of one line that names it."""
 
-from collections.abc import Iterable
+import inspect
+from collections.abc import Callable, Iterable
+from functools import wraps
 from operator import index
 from os import PathLike
 from pathlib import Path
-from typing import Final
+from typing import Final, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from services.common.errors import InputError
 
+_Arguments = ParamSpec("_Arguments")
+_Found = TypeVar("_Found")
+
 _SHOWN: Final = 40
 """Largest number of characters of a value in a message."""
+
+
+def known_arguments(
+    hint: str = "",
+) -> Callable[[Callable[_Arguments, _Found]], Callable[_Arguments, _Found]]:
+    """Return a decorator by which unknown, missing and repeated arguments raise InputError.
+
+    `hint` states where else an unknown argument may belong.
+    """
+
+    def decorated(function: Callable[_Arguments, _Found]) -> Callable[_Arguments, _Found]:
+        signature = inspect.signature(function)
+        known = ", ".join(signature.parameters)
+
+        @wraps(function)
+        def checked(*given: _Arguments.args, **named: _Arguments.kwargs) -> _Found:
+            try:
+                signature.bind(*given, **named)
+            except TypeError as error:
+                raise InputError(
+                    f"{function.__name__}: {error}; its arguments are {known}{hint}"
+                ) from None
+            return function(*given, **named)
+
+        return checked
+
+    return decorated
 
 
 def number(name: str, value: object, low: float, high: float) -> float:
@@ -75,6 +107,11 @@ def path_of(name: str, value: object, right: str) -> Path:
     if not isinstance(value, str | PathLike):
         raise wrong(name, value, right)
     return Path(value)
+
+
+def file_of(value: object) -> Path:
+    """Return the path of a file to write; raise InputError for anything that names no file."""
+    return path_of("path", value, "the name of a file to write")
 
 
 def names_of(name: str, value: object) -> list[str]:

@@ -16,7 +16,7 @@ from services.common.kinds import RESULTS
 from services.execution.blas import one_blas_thread
 from services.execution.fuse_results import FusedElements, crossings_to_fuse, fuse_crossings
 from services.identification.comparison import baseline_cautions
-from services.notebook.arguments import path_of
+from services.notebook.arguments import file_of, known_arguments, path_of
 from services.notebook.read import Name, given_site
 from services.notebook.showing import RIGIDITY_HEAD, html_table, rigidity_cells
 from services.notebook.solution import Identification
@@ -58,8 +58,9 @@ class Fusion(NamedTuple):
 
     def to_json(self, path: str | Path) -> None:
         """Write results.json, as `driveby fuse --json` does."""
-        check_writable(Path(path), kinds=(RESULTS,))
-        write_atomically(Path(path), results_json(self.results))
+        file = file_of(path)
+        check_writable(file, kinds=(RESULTS,))
+        write_atomically(file, results_json(self.results))
 
     def __repr__(self) -> str:
         """Return one line for each bridge."""
@@ -84,6 +85,7 @@ class Fusion(NamedTuple):
         return f"{name}: {number} {noun} fused, {state.verdict}; {state.finding or ''}".rstrip("; ")
 
 
+@known_arguments()
 def fuse(
     *sources: Name | Identification | Fusion | Results,
     baseline: Name | Identification | Fusion | Results | None = None,
@@ -102,7 +104,7 @@ def fuse(
         raise InputError("no results given, results.json or the value of identify() expected")
     name = next((str(one) for one in sources if isinstance(one, str | PathLike)), "fuse")
     each = [_results("source", one) for one in sources]
-    _check_identifiers(each)
+    check_identifiers(each)
     found = crossings_to_fuse(name, each)
     stored = None
     if baseline is not None:
@@ -118,7 +120,7 @@ def fuse(
         )
     if stored is not None:
         for line in baseline_cautions(fused.results.bridges, stored[1].bridges):
-            warnings.warn(line, stacklevel=2)
+            warnings.warn(line, stacklevel=3)
     known = _newest_site(sources) if site is None else given_site(site)
     return Fusion(fused.results, fused.bridges, known, None if stored is None else stored[1])
 
@@ -132,7 +134,7 @@ def _results(name: str, source: object) -> Results:
     return load_results(path_of(name, source, RESULTS_EXPECTED))
 
 
-def _check_identifiers(files: Sequence[Results]) -> None:
+def check_identifiers(files: Sequence[Results]) -> None:
     """Raise InputError if crossings of one identifier have different estimates."""
     known: dict[str, CrossingResult] = {}
     for one in (crossing for results in files for crossing in results.crossings):

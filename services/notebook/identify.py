@@ -14,7 +14,7 @@ from services.execution.offline import identify_drives
 from services.finding.order import Read, cached_reader, index_messages
 from services.history.draws import Draws
 from services.identification.methods import lacks_noise
-from services.notebook.arguments import whole, wrong
+from services.notebook.arguments import known_arguments, whole, wrong
 from services.notebook.read import Name, given_site, messages_of_paths, paths_of, site_of_paths
 from services.notebook.simulate import Simulation
 from services.notebook.solution import Identification, Solution
@@ -26,6 +26,7 @@ _NO_NOISE: Final = (
 _SOURCES: Final = "a recording (.mcap), a folder of CSV files, a list of these or a simulation"
 
 
+@known_arguments()
 def identify(
     source: Name | Sequence[Name] | Simulation,
     *,
@@ -57,7 +58,7 @@ def identify(
         known, name = site_of_paths(paths, site), ", ".join(str(path) for path in paths)
         read = cached_reader(lambda again: messages_of_paths(paths, known, site, vehicle))
     if lacks_noise(known, settings.method):
-        warnings.warn(_NO_NOISE, stacklevel=2)
+        warnings.warn(_NO_NOISE, stacklevel=3)
     kept: dict[str, Draws] = {}
 
     def keep(crossing_id: str, chains: Draws) -> None:
@@ -85,8 +86,9 @@ def _several(source: object) -> list[Name]:
     several = list(source)
     if any(isinstance(one, Simulation) for one in several):
         raise InputError(
-            "source is a list with a simulation, it must be one simulation; "
-            "fuse(identify(a), identify(b)) fuses several"
+            "source is a list with a simulation, it must be one simulation; fuse(identify(a), "
+            "identify(b)) fuses several, each started at another time: "
+            'b = b.started_at("2026-05-01T09:30:00Z")'
         )
     return several
 

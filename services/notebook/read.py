@@ -11,7 +11,7 @@ from schemas.topics import Message
 from services.common.errors import InputError
 from services.drives.importing import messages_of_folder, vehicle_of
 from services.drives.signals import Signals, signals_of_folder, signals_of_recording
-from services.notebook.arguments import path_of
+from services.notebook.arguments import known_arguments, path_of
 from services.recordings.recording import read_messages, read_site
 
 Name: TypeAlias = str | PathLike[str]
@@ -20,6 +20,7 @@ _SOURCE: Final = "a recording (.mcap) or a folder of CSV files"
 _SITE: Final = "the name of a site file or what load_site() returns"
 
 
+@known_arguments()
 def read(
     *sources: Name, site: Name | Site | None = None, vehicle: str | None = None
 ) -> list[Signals]:

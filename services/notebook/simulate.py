@@ -15,7 +15,15 @@ from services.drives.runs import run_to_messages
 from services.drives.signals import Signals, signals_of_run
 from services.execution.blas import one_blas_thread
 from services.finding.placed import middle_site
-from services.notebook.arguments import number, numbers, one_or_two, whole, wrong
+from services.notebook.arguments import (
+    file_of,
+    known_arguments,
+    number,
+    numbers,
+    one_or_two,
+    whole,
+    wrong,
+)
 from services.notebook.read import Name, given_site
 from services.simulation.drive import (
     DrivenRoad,
@@ -91,9 +99,13 @@ class Simulation(NamedTuple):
         Raise InputError if there is a recording, which only `force` replaces, or if it cannot be
         written.
         """
-        write_drive(Path(path), self.drive, self.site, force=force)
+        write_drive(file_of(path), self.drive, self.site, force=force)
 
 
+@known_arguments(
+    "; simulate_recording() has every option of driveby simulate, and Simulation.started_at() sets "
+    "the start"
+)
 def simulate(
     *,
     scenario: int | None = None,

@@ -21,7 +21,7 @@ from services.history.draws import (
     posterior,
     write_draws,
 )
-from services.notebook.arguments import wrong
+from services.notebook.arguments import file_of, wrong
 from services.notebook.inference import prior_of, statistics_of
 from services.notebook.showing import MAX_SHOWN, all_as_html, as_html, counted, one_line
 
@@ -145,20 +145,22 @@ class Identification(NamedTuple):
         Raise InputError without draws, or if xarray and h5netcdf are not installed and the file is
         no `.npz`.
         """
-        check_draws_file(Path(path))
+        file = file_of(path)
+        check_draws_file(file)
         if not any(solution.draws for solution in self.solutions):
-            raise InputError(f"{path}: no crossing has draws; method pre has, with draws=True")
+            raise InputError(f"{file}: no crossing has draws; method pre has, with draws=True")
         some = [solution for solution in self.solutions if solution.draws]
         groups = {}
-        if Path(path).suffix == ".nc":
+        if file.suffix == ".nc":
             crossings = [solution.crossing for solution in some]
             groups = {"prior": prior_of(crossings), "sample_stats": statistics_of(crossings)}
-        write_draws(Path(path), (_draws_of(solution) for solution in some), groups)
+        write_draws(file, (_draws_of(solution) for solution in some), groups)
 
     def to_json(self, path: str | Path) -> None:
         """Write results.json, as `driveby identify --json` does."""
-        check_writable(Path(path), kinds=(RESULTS,))
-        write_atomically(Path(path), results_json(self.results))
+        file = file_of(path)
+        check_writable(file, kinds=(RESULTS,))
+        write_atomically(file, results_json(self.results))
 
 
 def one_solution(name: str, found: object, function: str) -> Solution:

@@ -560,8 +560,10 @@ def test_site_without_noise_is_warned_of_before_pre(
 
 
 def test_simulations_are_identified_one_by_one(simulation: driveby.Simulation) -> None:
-    with pytest.raises(driveby.InputError, match="source is a list with a simulation, it must be"):
-        driveby.identify([simulation])
+    with pytest.raises(driveby.InputError) as caught:
+        driveby.identify([simulation, simulation])
+    assert str(caught.value).startswith("source is a list with a simulation, it must be one simul")
+    assert 'b = b.started_at("2026-05-01T09:30:00Z")' in str(caught.value)
 
 
 # -- what is wrong is said in one line
@@ -620,6 +622,16 @@ def test_simulations_are_identified_one_by_one(simulation: driveby.Simulation) -
         (lambda: driveby.fuse(3), "source is 3, it must be the name of a results file"),
         (lambda: driveby.fuse(["a.json"]), "source is ['a.json'], it must be the name of a"),
         (lambda: driveby.report(["a.json"]), "source is ['a.json'], it must be the name of a"),
+        (
+            lambda: driveby.simulate(start="x"),
+            "simulate: got an unexpected keyword argument 'start'",
+        ),
+        (lambda: driveby.simulate(start="x"), "Simulation.started_at() sets the start"),
+        (lambda: driveby.identify(), "identify: missing a required argument: 'source'"),
+        (lambda: driveby.fuse("a", sites="b"), "its arguments are sources, baseline, fuse_suspect"),
+        (lambda: driveby.report("a.json", title="b"), "report: got an unexpected keyword argument"),
+        (lambda: driveby.survey(), "survey: missing a required argument: 'site'"),
+        (lambda: driveby.read("a", b=3), "read: got an unexpected keyword argument 'b'"),
         (lambda: driveby.plot("a.json"), 'found is "a.json", it must be what identify() or'),
         (lambda: driveby.plot_chains(3), "solution is 3, it must be what identify() returns"),
     ],
@@ -680,7 +692,8 @@ def test_fused_bridge_is_that_of_the_command_line(tmp_path: Path) -> None:
     cells = as_in_the_terminal(fused.bridges["bridge-1"].elements["EI_1"], 16e9)
     row = "".join(f"<td>{cell}</td>" for cell in cells)
     assert f"<td>EI_1</td>{row}" in fused._repr_html_()
-    again = driveby.fuse(fused.results, baseline=fused.results)
+    with pytest.warns(UserWarning, match="bridge-1: The baseline has the same crossings"):
+        again = driveby.fuse(fused.results, baseline=fused.results)
     assert again.bridges["bridge-1"].probability_of_loss is not None
     with pytest.raises(driveby.InputError, match="no results given"):
         driveby.fuse()
@@ -702,6 +715,37 @@ def test_crossings_of_one_identifier_must_be_the_same(found: driveby.Identificat
         driveby.fuse(found, other)
     assert str(caught.value).startswith(f"{one.crossing_id}: two crossings with this identifier")
     assert "simulation.started_at(" in str(caught.value)
+
+
+def test_report_of_different_crossings_of_one_identifier_is_refused(
+    found: driveby.Identification, tmp_path: Path
+) -> None:
+    """Of two simulations with one start the report would show the newest alone."""
+    (one,) = found.results.crossings
+    assert one.parameters is not None
+    changed = one.parameters | {"rhoA": one.parameters["rhoA"].model_copy(update={"mean": 1.0})}
+    other = found._replace(results=of_estimates(one.model_copy(update={"parameters": changed})))
+    with pytest.raises(driveby.InputError) as caught:
+        driveby.report(found, other, output=tmp_path / "a.html")
+    assert str(caught.value).startswith(f"{one.crossing_id}: two crossings with this identifier")
+    assert not (tmp_path / "a.html").exists()
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda found, simulation: found.to_json(3),
+        lambda found, simulation: found.to_netcdf(3),
+        lambda found, simulation: simulation.write(3),
+    ],
+)
+def test_file_of_no_name_is_one_line(
+    found: driveby.Identification,
+    simulation: driveby.Simulation,
+    write: Callable[[driveby.Identification, driveby.Simulation], None],
+) -> None:
+    with pytest.raises(driveby.InputError, match="path is 3, it must be the name of a file to wri"):
+        write(found, simulation)
 
 
 def test_stored_results_are_the_same_as_those_in_memory(
@@ -747,7 +791,9 @@ def test_plot_draws_a_fused_bridge(found: driveby.Identification, tmp_path: Path
     tops = sorted(f"{e.mean / 1e9:.2f}" for e in fused.bridges["bridge-1"].elements.values())
     assert len(tops) == 7
     assert panel.get_ylim()[1] > float(tops[-1])
-    before = driveby.plot(driveby.fuse(found, baseline=found)).axes[0].get_legend()
+    with pytest.warns(UserWarning, match="The baseline has the same crossings"):
+        compared = driveby.fuse(found, baseline=found)
+    before = driveby.plot(compared).axes[0].get_legend()
     assert "baseline" in " ".join(text.get_text() for text in before.get_texts())
     found.to_json(tmp_path / "found.json")
     stored = driveby.fuse(tmp_path / "found.json")
