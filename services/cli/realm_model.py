@@ -33,6 +33,10 @@ from services.viewer.crossing_view import (
 
 _RATE_S: Final = 5.0
 """Duration in s over which rates are computed."""
+_LAGS: Final = 100
+"""Number of batches, of 5 to 10 s, by which a steady lag is recognised."""
+_STEADY_S: Final = 0.5
+"""Largest spread of a steady lag: data that are sent late catch up meanwhile."""
 SILENT_S: Final = 3.0
 """Silence in s after which a truck does not drive."""
 _MAX_CROSSINGS: Final = 200
@@ -60,7 +64,16 @@ class TruckRow:
         self.speed_m_per_s: float | None = None
         self.lag_s = 0.0
         """Age of its newest samples at their arrival, s."""
+        self.lags_s: deque[float] = deque(maxlen=_LAGS)
+        """Ages of its last batches."""
         self.received_s = 0.0
+
+    @property
+    def steady_lag_s(self) -> float | None:
+        """Lag that was equal for all last batches; None if it varied, or there are few."""
+        if len(self.lags_s) < _LAGS or max(self.lags_s) - min(self.lags_s) > _STEADY_S:
+            return None
+        return min(self.lags_s)
 
     def rates(self, now_s: float) -> tuple[float, float]:
         """Return batches and fixes per second."""
@@ -182,6 +195,7 @@ class RealmModel:
             truck.batches.append(now_s)
             lasts_s = max(one.samples.size / one.rate_hz for one in batch.channels.values())
             truck.lag_s = (now_ns - batch.wall_time_ns) * 1e-9 - lasts_s
+            truck.lags_s.append(truck.lag_s)
         else:
             truck.speed_m_per_s = decode_gnss(payload).speed_m_per_s
             truck.fixes.append(now_s)

@@ -29,6 +29,8 @@ _WIDE: Final = 110
 """Columns from which intervals and reasons fit next to each other."""
 _AHEAD_S: Final = 0.5
 """Time in s by which samples lie in the future when a clock is wrong."""
+_BEHIND_S: Final = 2.0
+"""Steady age in s at arrival from which a clock is wrong: no network takes so long."""
 _OLD_S: Final = 60.0
 """Age in s at arrival from which samples are old."""
 _LATE_S: Final = 150.0
@@ -36,7 +38,7 @@ _LATE_S: Final = 150.0
 _MAX_ALARMS: Final = 4
 """Maximum number of alarm lines at the head of a page, fewer on a low one."""
 _MAX_BRIDGES: Final = 4
-_NO_ALARM: Final = (
+NO_ALARM: Final = (
     "No alarm was received; it is not known here whether driveby alarm serve watches any bridge."
 )
 _VERDICTS: Final = {"good": "green", "suspect": "yellow", "rejected": "red"}
@@ -86,7 +88,7 @@ def page(
         if len(rows) > len(shown):
             parts.append(Text(f"  and {len(rows) - len(shown)} earlier", style="dim"))
     if model.bridges and not alarms:
-        parts.append(Text(_NO_ALARM, style="dim", no_wrap=True, overflow="ellipsis"))
+        parts.append(Text(NO_ALARM, style="dim", no_wrap=True, overflow="ellipsis"))
     if model.bridges:
         standing = {name for name, one in model.alarms.items() if one.acknowledged is None}
         parts.append(_bridges(model.bridges, standing))
@@ -165,10 +167,19 @@ def _wrong_time_notes(trucks: Sequence[tuple[str, TruckRow]], realm: str) -> lis
     if is_from_recording(realm):
         return []
     old = [name for name, truck in trucks if truck.lag_s > _OLD_S]
+    behind = [
+        f"{name} by {_length(lag_s)}"
+        for name, truck in trucks
+        if name not in old and (lag_s := truck.steady_lag_s or 0.0) > _BEHIND_S
+    ]
     ahead = [name for name, truck in trucks if truck.lag_s < -_AHEAD_S]
     why = "samples are old on arrival: replayed faster than real time, sent late, or a clock is "
     notes = [
         (old, f"{why}wrong"),
+        (
+            behind,
+            "all samples are equally old: the clock of the truck is behind, or this one's ahead",
+        ),
         (ahead, "samples are from the future: the clock of the truck or of this machine is wrong"),
     ]
     return [

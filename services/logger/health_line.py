@@ -8,6 +8,8 @@ from services.common.naming import count_of
 from services.logger.clocks import STEP_NS
 
 _MAX_NAMED = 3
+_BEHIND_S = 2.0
+"""Smallest offset of a clock that is named as behind."""
 _LONG_LAG_S = 60.0
 """Shortest lag that is explained: the network is rarely the cause."""
 
@@ -29,13 +31,23 @@ def health_line(figures: Mapping[str, float]) -> str:
 
 
 def clock_note(figures: Mapping[str, float]) -> str:
-    """Return the trucks whose clocks are ahead of the logger's, for `health`; empty without any."""
+    """Return the trucks whose clocks differ from the logger's, for `health`; empty without any.
+
+    Their offset is the shortest delay in minutes, so a network explains at most a second or two.
+    """
     name = "clock_offset_s/"
-    ahead = {
-        truck.removeprefix(name): -offset_s
+    offsets_s = {
+        truck.removeprefix(name): offset_s
         for truck, offset_s in sorted(figures.items())
-        if truck.startswith(name) and offset_s * NS_PER_S <= -STEP_NS
+        if truck.startswith(name)
     }
-    shown = [f"{truck} by {by_s:.1f} s" for truck, by_s in list(ahead.items())[:_MAX_NAMED]]
-    more = " …" if len(ahead) > _MAX_NAMED else ""
-    return f"clocks ahead: {', '.join(shown)}{more}" if shown else ""
+    ahead = {truck: -one for truck, one in offsets_s.items() if one * NS_PER_S <= -STEP_NS}
+    behind = {truck: one for truck, one in offsets_s.items() if one >= _BEHIND_S}
+    notes = (_named("clocks ahead", ahead), _named("clocks behind, or all samples late", behind))
+    return "; ".join(note for note in notes if note)
+
+
+def _named(what: str, trucks_s: Mapping[str, float]) -> str:
+    shown = [f"{truck} by {by_s:.1f} s" for truck, by_s in list(trucks_s.items())[:_MAX_NAMED]]
+    more = " …" if len(trucks_s) > _MAX_NAMED else ""
+    return f"{what}: {', '.join(shown)}{more}" if shown else ""

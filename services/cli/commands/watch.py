@@ -87,11 +87,11 @@ def _print_lines(
 ) -> None:
     from services.bus.realm_listener import other_realms_hint
     from services.cli.realm_model import RealmModel
-    from services.cli.watch_page import silent_trucks
+    from services.cli.watch_page import NO_ALARM, silent_trucks
 
     model = RealmModel()
     began_s = time.monotonic()
-    hinted, silent = "", frozenset[str]()
+    hinted, silent, is_monitoring_named = "", frozenset[str](), False
 
     def print_line(line: str | None) -> None:
         if line is not None:
@@ -111,6 +111,11 @@ def _print_lines(
         if is_empty and hint != hinted and now_s - began_s > _HINT_AFTER_S:
             hinted = hint
             print_line(hint or None)
+        if model.alarms:
+            is_monitoring_named = True
+        if model.bridges and not is_monitoring_named and now_s - began_s > _HINT_AFTER_S:
+            is_monitoring_named = True
+            print_line(NO_ALARM)
         stop.wait(_PERIOD_S)
 
 

@@ -1,6 +1,7 @@
 """`driveby watch`: what it knows of a realm, and the page that it makes of it."""
 
 import io
+import threading
 from pathlib import Path
 
 import pytest
@@ -9,10 +10,12 @@ from rich.console import Console
 from schemas.proto import driveby_pb2 as pb
 from schemas.site import Site
 from schemas.site_file import load_site
+from services.bus.realm_listener import BusMessage
 from services.cli import main as cli
 from services.cli import realm_model
+from services.cli.commands import watch
 from services.cli.realm_model import RealmModel
-from services.cli.watch_page import bars, page, silent_trucks
+from services.cli.watch_page import NO_ALARM, bars, page, silent_trucks
 from tests.unit.cli.watching import (
     NOW_NS,
     NOW_S,
@@ -281,3 +284,43 @@ def test_absent_alarms_are_no_reassurance_on_the_page(site: Site) -> None:
     assert line(drawn(watched), said).endswith("any bridge.")
     deliver(watched, alarm())
     assert not any(one.startswith(said) for one in drawn(watched))
+
+
+def test_clock_that_is_behind_is_explained() -> None:
+    watched = RealmModel()
+    drives(watched, "truck-1", lag_s=9.0)
+    drives(watched, "truck-2", lag_s=1.0)
+    drives(watched, "truck-3", lag_s=30.0)
+    watched.trucks["truck-3"].lags_s.extend([9.0] * 50)  # it catches up
+    said = "truck-1 by 9.0 s: all samples are equally old: the clock of the truck is behind"
+    lines = [one.strip() for one in drawn(watched)]
+    assert [one for one in lines if "equally old" in one] == [f"{said}, or this one's ahead"]
+    replayed = drawn(watched, listened=Listened("replay-monday"))
+    assert not any("equally old" in one for one in replayed)
+
+
+class Batches(Listened):
+    """A listener that stops with its last batch."""
+
+    def __init__(self, batches: list[list[BusMessage]]) -> None:
+        super().__init__()
+        self._batches = batches
+        self.stop = threading.Event()
+
+    def heard(self) -> list[BusMessage]:
+        if len(self._batches) == 1:
+            self.stop.set()
+        return self._batches.pop(0)
+
+
+def test_lines_without_an_alarm_are_no_reassurance(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watch, "_HINT_AFTER_S", 0.0)
+    monkeypatch.setattr(watch, "_PERIOD_S", 0.0)
+    of_bridge = bridge_state(site)
+    for messages, expected in (([of_bridge], 1), ([of_bridge, alarm()], 0), ([], 0)):
+        printed: list[str] = []
+        listened = Batches([messages, []])
+        watch._print_lines(listened, listened.stop, printed.append)  # type: ignore[arg-type]
+        assert sum(one.endswith(NO_ALARM) for one in printed) == expected

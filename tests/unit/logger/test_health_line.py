@@ -4,12 +4,19 @@ from services.logger.health_line import clock_note, health_line
 
 
 def test_clocks_that_are_ahead_are_named() -> None:
-    figures = {"clock_offset_s/b": -3599.0, "clock_offset_s/a": -0.5, "clock_offset_s/c": 3600.0}
+    figures = {"clock_offset_s/b": -3599.0, "clock_offset_s/a": -0.5, "clock_offset_s/c": 0.1}
     assert clock_note(figures) == "clocks ahead: a by 0.5 s, b by 3599.0 s"
 
 
-def test_right_and_slow_clocks_need_no_note() -> None:
-    assert clock_note({"clock_offset_s/a": -0.4, "lag_s": -99.0, "clock_offset_s/b": 9.0}) == ""
+def test_clocks_that_are_behind_are_named() -> None:
+    behind = "clocks behind, or all samples late: b by 9.0 s"
+    assert clock_note({"clock_offset_s/b": 9.0}) == behind
+    both = {"clock_offset_s/a": -0.5, "clock_offset_s/b": 9.0}
+    assert clock_note(both) == f"clocks ahead: a by 0.5 s; {behind}"
+
+
+def test_right_clocks_need_no_note() -> None:
+    assert clock_note({"clock_offset_s/a": -0.4, "lag_s": -99.0, "clock_offset_s/b": 1.9}) == ""
 
 
 def test_one_truck_and_one_file_are_singular() -> None:
