@@ -1,10 +1,8 @@
-"""Recordings by their addresses in a real S3 server, which is killed, and refuses wrong keys.
+"""Recordings and folders in a real S3 server, which is killed, and refuses keys.
 
-s3s-fs 0.14.1 lists nothing where a request names an empty delimiter, as those of s3fs do: folders
-in a bucket are tested with moto alone.
+The server is OpenStack Swift; the first lines of s3_server.py install it.
 
-cargo install s3s-fs --version 0.14.1 --locked --features binary --root build/containers
-S3S_FS=…/s3s-fs pytest tests/containers/test_s3.py -m containers
+SWIFT=…/bin pytest tests/containers/test_s3.py -m containers
 """
 
 import os
@@ -21,6 +19,7 @@ import pytest
 from tests.builders.commands import Ended
 from tests.containers import s3_server
 from tests.containers.s3_server import S3Server
+from tests.containers.stack import ROOT
 from tests.drives import drives
 from tests.faults.clusters import results_of
 
@@ -44,21 +43,39 @@ def run(*words: object, env: dict[str, str]) -> Ended:
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[S3Server]:
-    program = s3_server.find()
-    if program is None:
-        pytest.skip("no s3s-fs for containers: the first lines of test_s3.py build it")
-    with s3_server.s3_server(program) as started:
+    programs = s3_server.find()
+    if programs is None:
+        pytest.skip("no Swift for containers: the first lines of s3_server.py install it")
+    with s3_server.s3_server(programs) as started:
+        python(started, "import s3fs; s3fs.S3FileSystem().mkdir('bucket')")
         yield started
+
+
+def python(server: S3Server, program: str, *words: object) -> str:
+    """Run a program with the keys of the bucket's owner; return what it prints."""
+    return subprocess.run(
+        [sys.executable, "-c", program, *map(str, words)],
+        env={**os.environ, **server.environment()},
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+    ).stdout
 
 
 def upload(server: S3Server, path: Path, to: str) -> None:
     """Copy a file into the bucket by s3fs, which sends a large one in parts."""
     program = "import sys, s3fs; s3fs.S3FileSystem().put_file(*sys.argv[1:])"
-    subprocess.run(
-        [sys.executable, "-c", program, str(path), f"bucket/{to}/{path.name}"],
-        env={**os.environ, **server.environment()},
-        check=True,
-    )
+    python(server, program, path, f"bucket/{to}/{path.name}")
+
+
+def names_below(server: S3Server, folder: str) -> list[str]:
+    program = "import sys, s3fs; print(*s3fs.S3FileSystem().find(sys.argv[1]), sep='\\n')"
+    return python(server, program, f"bucket/{folder}").splitlines()
+
+
+def allow_everyone_to_read(server: S3Server) -> None:
+    acl = "import boto3; boto3.client('s3').put_bucket_acl(Bucket='bucket', ACL='public-read')"
+    python(server, acl)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +92,8 @@ def large(server: S3Server, small: Path, tmp_path_factory: pytest.TempPathFactor
     began_s = time.monotonic()
     upload(server, path, "large")
     print(f"\n{LARGE_BYTES / 1e6:.0f} MB uploaded in {time.monotonic() - began_s:.0f} s")
-    assert (server.bucket / "large" / path.name).stat().st_size == LARGE_BYTES
+    size = "import sys, s3fs; print(s3fs.S3FileSystem().size(sys.argv[1]))"
+    assert int(python(server, size, f"bucket/large/{path.name}")) == LARGE_BYTES
     return path
 
 
@@ -91,6 +109,48 @@ def test_recording_in_a_bucket_gives_what_it_gives_here(
     here, there = map(results_of, found)
     assert len(here["crossings"]) == 1
     assert there == here
+
+
+def test_folder_in_a_bucket_gives_what_it_gives_here(server: S3Server, tmp_path: Path) -> None:
+    """Its catalogue, results and history; with keys that may only read, nothing is written."""
+    paths = drives(tmp_path / "recordings", 3)
+    for path in paths:
+        upload(server, path, "fleet/day")
+    fleet, site = "s3://bucket/fleet", ROOT / "docs" / "site.example.toml"
+    found = [tmp_path / f"{number}.json" for number in range(3)]
+    histories = [tmp_path / name for name in ("history", "read-only", "catalogued")]
+    allow_everyone_to_read(server)
+    env, reader = server.environment(), server.environment(s3_server.READER)
+
+    def compare(source: object, number: int, env: dict[str, str]) -> Ended:
+        into, history = tmp_path / f"into-{number}", histories[number]
+        ended = run("identify", source, *QUICK, "--into", into, "--json", found[number], env=env)
+        assert ended.code == 0, ended
+        assert run("history", "add", into, "--history", history, env=env).code == 0
+        return ended
+
+    compare(paths[0].parent, 0, env)
+    ended = compare(fleet, 1, reader)
+    assert ended.err.count("\n") == 1
+    assert f"{fleet}: cannot write its catalogue" in ended.err
+    before = [f"bucket/fleet/day/{path.name}" for path in sorted(paths)]
+    assert names_below(server, "fleet") == before
+    ended = run("catalog", fleet, env=reader)
+    assert (ended.code, ended.err.count("\n")) == (1, 1), ended
+    assert "could not be written: Access Denied" in ended.err
+    first, again = (run("catalog", fleet, "--site", site, env=env) for _ in range(2))
+    assert (first.code, first.err, again.code, again.err) == (0, "", 0, "")
+    assert "3 recordings (3 new to the catalogue)" in first.out, first.out
+    assert "3 recordings (0 new to the catalogue)" in again.out, again.out
+    assert first.out.count(" over bridge-1, start to end") == len(paths), first.out
+    assert len(names_below(server, "fleet")) > len(before)
+    assert compare(fleet, 2, env).err == ""
+    here, *there = map(results_of, found)
+    assert len(here["crossings"]) == 3
+    assert there == [here, here]
+    shown = [run("history", "--history", history, env=env).out for history in histories]
+    assert "sim-drive  bridge-1  3 " in shown[0], shown[0]
+    assert shown[1:] == [shown[0], shown[0]]
 
 
 def test_server_killed_in_the_middle_of_a_gigabyte_is_one_line(
