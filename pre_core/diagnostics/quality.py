@@ -26,6 +26,8 @@ _SAME = 1e-6
 """Relative tolerance within which two channel assignments explain equally well."""
 
 
+_BINS = 100
+"""Bins of a signal between its median and an end of its range."""
 _FINE = 0.2
 """Largest converter step, relative to a bin, that does not show in it."""
 _FEWEST_LEVELS = 12
@@ -54,14 +56,14 @@ def smallest_difference(signals: FloatArray) -> float:
     return smallest
 
 
-def repeated_extremes(values: FloatArray, digits: float = 1e-5) -> int:
+def repeated_extremes(values: FloatArray) -> int:
     """Return how often a signal (n,) takes its maximum or its minimum, whichever is more frequent.
 
-    It is zero for coarse values (least step above `digits` of the largest), where repeats are
+    It is zero for coarse values (least step above 1e-5 of the largest), where repeats are
     expected.
     """
     distinct = np.unique(values)
-    if distinct.size < 3 or np.diff(distinct).min() > digits * np.abs(distinct).max():
+    if distinct.size < 3 or np.diff(distinct).min() > 1e-5 * np.abs(distinct).max():
         return 0
     return max(
         int(np.count_nonzero(values == distinct[0])), int(np.count_nonzero(values == distinct[-1]))
@@ -78,7 +80,7 @@ class SaturationEvidence(NamedTuple):
     level: float
 
 
-def pile_up(values: FloatArray, bins: int = 100) -> SaturationEvidence:
+def pile_up(values: FloatArray) -> SaturationEvidence:
     """Return how strongly a signal (n,) piles up at an end of its range, as when saturated.
 
     The density of an unsaturated signal decreases towards its ends: a smooth peak spends most of
@@ -95,15 +97,15 @@ def pile_up(values: FloatArray, bins: int = 100) -> SaturationEvidence:
         top = float(side.max())
         if not top > 0.0:
             continue
-        if step * bins > _FINE * top:
-            width = step * np.ceil(top / (bins * step))
+        if step * _BINS > _FINE * top:
+            width = step * np.ceil(top / (_BINS * step))
             count = int(top / width + 0.5) + 1
             if count < _FEWEST_LEVELS:
                 continue
             place = np.floor(side / width + 0.5).astype(np.int64).clip(-1, count - 1)
         else:
-            count = bins
-            place = np.floor(side * (bins / top)).astype(np.int64).clip(-1, bins - 1)
+            count = _BINS
+            place = np.floor(side * (_BINS / top)).astype(np.int64).clip(-1, _BINS - 1)
         counts = np.bincount(place[place >= 0], minlength=count).astype(np.float64)
         # A filter after the clipping overshoots the rail slightly.
         for k in range(count - 1, int(0.8 * count), -1):

@@ -17,6 +17,8 @@ FloatArray = NDArray[np.float64]
 
 REFERENCE_CYCLES_PER_M = 0.1
 WAVINESS = 2.0
+_FITTED_CYCLES_PER_M = (0.05, 1.0)
+"""Band of the spectrum to which the level of a road is fitted."""
 CLASSES = "ABCDEFGH"
 GEOMETRIC_MEAN_M3 = {name: 16e-6 * 4.0**i for i, name in enumerate(CLASSES)}
 
@@ -177,18 +179,16 @@ def iri_m_per_km(profile: Profile, segment_m: float | None = None) -> FloatArray
     )
 
 
-def roughness_coefficient_m3(
-    profile: Profile, band_cycles_per_m: tuple[float, float] = (0.05, 1.0)
-) -> float:
+def roughness_coefficient_m3(profile: Profile) -> float:
     """Return G_d(n_0) of a profile: the level of a line of slope -2 fitted to its spectrum."""
     spacing = float(profile.x_m[1] - profile.x_m[0])
     n, density = _welch(
         profile.height_m, spacing, min(profile.height_m.size, round(100.0 / spacing))
     )
-    lowest = max(band_cycles_per_m[0], 2.0 / (profile.x_m[-1] - profile.x_m[0]))
+    lowest = max(_FITTED_CYCLES_PER_M[0], 2.0 / (profile.x_m[-1] - profile.x_m[0]))
     level = density[1:] * (n[1:] / REFERENCE_CYCLES_PER_M) ** WAVINESS
     octave = np.floor(np.log2(n[1:] / lowest))
-    within = (n[1:] >= lowest) & (n[1:] <= band_cycles_per_m[1])
+    within = (n[1:] >= lowest) & (n[1:] <= _FITTED_CYCLES_PER_M[1])
     # Average within an octave before the logarithm, as ISO 8608 smooths: the mean logarithm of
     # single periodogram lines is far below the logarithm of their mean. Then every octave
     # has the same weight.

@@ -59,17 +59,13 @@ def detection_errors(
     return DetectionErrors(np.sqrt(alone + scale_error**2), np.sqrt(compared))
 
 
-def detection_probability(
-    loss: float, std: FloatArray, false_alarm: float = FALSE_ALARM
-) -> FloatArray:
+def detection_probability(loss: float, std: FloatArray) -> FloatArray:
     """Return the probabilities (e,) of detecting a loss in each element, with errors `std` (e,)."""
     shift = 1.0 / (1.0 - loss) - 1.0
-    return np.asarray(ndtr(shift / std + ndtri(false_alarm)))
+    return np.asarray(ndtr(shift / std + ndtri(FALSE_ALARM)))
 
 
-def minimum_detectable_loss(
-    std: FloatArray, probability: float = DETECTION_PROBABILITY, false_alarm: float = FALSE_ALARM
-) -> FloatArray:
-    """Return the losses (e,) detected with probability `probability`, with errors `std` (e,)."""
-    shift = (ndtri(probability) - ndtri(false_alarm)) * std
+def minimum_detectable_loss(std: FloatArray) -> FloatArray:
+    """Return the losses (e,) detected with `DETECTION_PROBABILITY`, with errors `std` (e,)."""
+    shift = (ndtri(DETECTION_PROBABILITY) - ndtri(FALSE_ALARM)) * std
     return np.asarray(shift / (1.0 + shift))

@@ -36,6 +36,7 @@ FloatArray = NDArray[np.float64]
 
 _DRAWS, _CHAINS = 1000, 2
 """Number of draws, which give a standard deviation to 2 %, and of chains."""
+_SEED = 1
 
 
 class PosteriorAtTruth(NamedTuple):
@@ -153,7 +154,6 @@ def survey_spreads(
     precision: FloatArray,
     lengths_m: FloatArray,
     truth: FloatArray | None = None,
-    seed: int = 1,
 ) -> SurveySpreads:
     """Return the posterior spreads of a survey of this precision (b, b).
 
@@ -179,7 +179,7 @@ def survey_spreads(
         known.log_odds,
         truth[elements],
     )
-    drawn = np.concatenate([draws(of, _DRAWS, seed, chain) for chain in range(_CHAINS)])
+    drawn = np.concatenate([draws(of, _DRAWS, _SEED, chain) for chain in range(_CHAINS)])
     ln_ei = drawn[:, elements] * known.sigma
     return SurveySpreads(ln_ei.std(axis=0), float((ln_ei @ lengths_m / lengths_m.sum()).std()))
 

@@ -19,9 +19,7 @@ _TYRES_N_PER_M: Final = (2.0e6, 3.7e6, 3.7e6)
 _TRACKS_M: Final = (2.05, 1.83, 1.83)
 
 
-def usual_tandem(
-    noise_ug_per_rthz: float, tyres: str = "twin", *, equalised: bool = True
-) -> Vehicle:
+def usual_tandem(noise_ug_per_rthz: float, tyres: str = "twin") -> Vehicle:
     """Return a three-axle tipper of `TANDEM_KG` with `tyres` ("single" or "twin") on its tandem.
 
     Four sensors are in the middle: on the body above the front axle and above the tandem, and on
@@ -52,7 +50,7 @@ def usual_tandem(
         "gps_antenna_to_front_axle_m": 0.0,
         "cg_height_m": 1.3,
         "axles": axles,
-        "bogies": [{"axles": [2, 3], "equalised": equalised}],
+        "bogies": [{"axles": [2, 3], "equalised": True}],
         "sensors": [
             _sensor("sprung_front", noise_ug_per_rthz, on="body", position_m=0.0),
             _sensor("sprung_rear", noise_ug_per_rthz, on="body", position_m=middle_m),

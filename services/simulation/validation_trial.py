@@ -369,16 +369,14 @@ def _of_weak(values: tuple[float, ...], tried: ValidationCrossing) -> float:
     return values[tried.weak_element - 1]
 
 
-def judge_trial(
-    tried: Sequence[ValidationCrossing], planned: int = CROSSINGS
-) -> TrialOutcome | None:
+def judge_trial(tried: Sequence[ValidationCrossing]) -> TrialOutcome | None:
     """Return whether the first crossings of a trial pass or fail; None if there are too few.
 
     A trial ends early where further crossings cannot save it, or where there is no objection.
     """
     figures = figures_of(tried)
     elements = len(tried[0].ei_ratio) if tried else 0
-    against = _against(tried, figures, planned, elements)
+    against = _against(tried, figures, elements)
     if against is not None:
         return TrialOutcome(False, against)
     is_sure = (
@@ -386,13 +384,13 @@ def judge_trial(
         and figures.covered >= SURE_COVERAGE * figures.intervals
         and (figures.rms_z or 0.0) <= SURE_RMS_Z
     )
-    if figures.crossings < planned and not is_sure:
+    if figures.crossings < CROSSINGS and not is_sure:
         return None
     return TrialOutcome(True, _for(figures))
 
 
 def _against(
-    tried: Sequence[ValidationCrossing], figures: ValidationFigures, planned: int, elements: int
+    tried: Sequence[ValidationCrossing], figures: ValidationFigures, elements: int
 ) -> str | None:
     """Return an objection that no further crossing could remove."""
     for one in tried:
@@ -410,13 +408,13 @@ def _against(
                 "half its rigidity, for a sound one"
             )
     others = figures.crossings - figures.good
-    if others > planned - FEWEST_GOOD:
+    if others > CROSSINGS - FEWEST_GOOD:
         return (
             f"{figures.good} of {figures.crossings} crossings are good, at least {FEWEST_GOOD} of "
-            f"{planned} must be ({_why_not(tried)})"
+            f"{CROSSINGS} must be ({_why_not(tried)})"
         )
     # All remaining intervals may contain the truth, with zero errors.
-    to_come = (planned - figures.crossings) * elements
+    to_come = (CROSSINGS - figures.crossings) * elements
     missed = figures.intervals - figures.covered
     if missed > (1.0 - LEAST_COVERAGE) * (figures.intervals + to_come):
         return (

@@ -41,14 +41,11 @@ class ValidationRunner:
         site: Site,
         settings: IdentificationSettings,
         processes: ProcessExecutor,
-        *,
-        check_every_s: float = CHECK_EVERY_S,
     ) -> None:
         self._folder = folder
         self._site = site
         self._settings = settings
         self._processes = processes
-        self._check_every_s = check_every_s
         self._wanted: deque[VehicleBridgePair] = deque()
         self._trial: ValidationTrial | None = None
         self._numbers: dict[str, int] = {}
@@ -82,7 +79,7 @@ class ValidationRunner:
         """
         passed = self._scan_folder() if now_s >= self._next_check_s else {}
         if now_s >= self._next_check_s:
-            self._next_check_s = now_s + self._check_every_s
+            self._next_check_s = now_s + CHECK_EVERY_S
         if self._trial is None and self._wanted:
             pair = next((p for p in order() if p in self._wanted), self._wanted[0])
             self._wanted.remove(pair)
