@@ -18,11 +18,10 @@ from zenoh import handlers
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity
-from schemas.topics import Key, check_realm, parse_key, selector, topic
+from schemas.topics import Key, parse_key, selector, topic
 from services.bus.liveness import LivenessProbe, StaleConnectionError
-from services.bus.session import wait_for_router
+from services.bus.session import checked_realm, wait_for_router
 from services.bus.subscription import RawSample, SeenSequences, subscribe_latest
-from services.common.errors import InputError
 
 _log = logging.getLogger(__name__)
 
@@ -133,7 +132,7 @@ class RealmListener:
         again: Callable[[], zenoh.Session | None] = lambda: None,
     ) -> None:
         """Listen; raise InputError if the realm is invalid."""
-        self.realm = check_listenable(realm)
+        self.realm = checked_realm(realm)
         self._past_s = past_s
         self._again = again
         self._seen = SeenSequences()
@@ -246,7 +245,7 @@ def open_listener(
 
     Raise InputError for a bad realm, endpoint or credentials.
     """
-    check_listenable(realm)
+    checked_realm(realm)
     with contextlib.ExitStack() as open_now:
 
         def connect() -> zenoh.Session | None:
@@ -263,14 +262,6 @@ def open_listener(
             yield heard
         finally:
             heard.close()
-
-
-def check_listenable(realm: str) -> str:
-    """Return a realm; raise InputError if it is invalid."""
-    try:
-        return check_realm(realm)
-    except ValueError as error:
-        raise InputError(str(error)) from None
 
 
 def other_realms_hint(realm: str, elsewhere: dict[str, set[str]]) -> str | None:

@@ -32,6 +32,7 @@ from typing import Any
 
 import zenoh
 
+from schemas.topics import check_realm
 from services.bus.credentials import (
     CONFIGURATION,
     LISTENERS,
@@ -62,6 +63,14 @@ _RUNTIME = "(rx: (handover: acc), acc: (worker_threads: 2))"
 """Threads of a router: the waiting threads also read. Waking Zenoh's own pool of receiving threads
 for every message costs more than handling it. There are two, because new connections need one too
 and one may be blocked by a frozen subscriber."""
+
+
+def checked_realm(realm: str) -> str:
+    """Return a realm; raise InputError if it is invalid."""
+    try:
+        return check_realm(realm)
+    except ValueError as error:
+        raise InputError(str(error)) from None
 
 
 def open_session(

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+from services.common.files import sync
+
 
 class RawFile(Protocol):
     """An unbuffered file opened for writing, as `open(path, "xb", buffering=0)` returns it."""
@@ -50,14 +52,6 @@ def write_all(file: RawFile, data: bytes) -> None:
         view = view[taken:]
 
 
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def _free_bytes(folder: Path) -> int:
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
@@ -67,6 +61,6 @@ def _free_bytes(folder: Path) -> int:
 DISK = Disk(
     create=lambda path: path.open("xb", buffering=0),
     sync=lambda descriptor: os.fsync(descriptor),
-    sync_folder=_sync_folder,
+    sync_folder=sync,
     free_bytes=_free_bytes,
 )

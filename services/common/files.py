@@ -59,11 +59,11 @@ def replaced_atomically(path: Path, *, force: bool = False) -> Iterator[Path]:
     try:
         try:
             yield temporary
-            _sync(temporary)
+            sync(temporary)
             check_writable(path, force=force)  # check again: the block may have taken long
             _check_like(path, temporary)
             temporary.replace(path)
-            sync_folder(path)
+            sync(path.parent)
         except OSError as error:
             raise FailureError(f"{path}: could not be written: {_reason(error)}") from error
     finally:
@@ -294,12 +294,8 @@ def read_bytes(path: Path) -> bytes:
         raise InputError(f"{path}: cannot be read: {_reason(error)}") from error
 
 
-def sync_folder(path: Path) -> None:
-    """Sync the folder of a file, so that its new name survives a loss of power."""
-    _sync(path.parent)
-
-
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Sync a file, or a folder, so that a new name in it survives a loss of power."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from services.common.errors import FailureError, InputError
-from services.common.files import sync_folder
+from services.common.files import sync
 from services.recordings.recording import is_being_written, is_closed
 from services.recordings.recovery import describe, put_aside, recover_recording
 
@@ -55,5 +55,5 @@ def _complete(path: Path) -> None:
         return
     os.utime(complete, ns=(times.st_atime_ns, times.st_mtime_ns))  # earlier runs expire by age
     complete.replace(path)
-    sync_folder(path)
+    sync(path.parent)
     _log.info("%s: its worker was killed; %s", path, describe(recovery))

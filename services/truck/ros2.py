@@ -19,11 +19,10 @@ from zenoh import handlers
 from schemas.events import Event, EventKind
 from schemas.signals import GnssFix
 from schemas.site_file import load_site, vehicle_toml
-from schemas.topics import check_realm
 from services.bus.credentials import check_speaks_for
 from services.bus.playback import confirm, stopped_by_signals
-from services.bus.session import open_session
-from services.common.errors import FailureError, InputError, one_line
+from services.bus.session import checked_realm, open_session
+from services.common.errors import FailureError, one_line
 from services.drives.importing import vehicle_of
 from services.drives.ros2_anomalies import (
     DROPPED,
@@ -77,11 +76,7 @@ def run(asked: GatewaySettings, ready: Callable[[], None] = lambda: None) -> int
     everything then.
     """
     check_rosbags()
-    realm, endpoint, tls = asked.realm, asked.address, asked.tls
-    try:
-        check_realm(realm)
-    except ValueError as error:
-        raise InputError(str(error)) from None
+    realm, endpoint, tls = checked_realm(asked.realm), asked.address, asked.tls
     known = load_site(asked.site)
     vehicle = vehicle_of(known, str(asked.site), asked.vehicle)
     # It is counted like others; the sensor's topic is free for another one.

@@ -29,7 +29,7 @@ from schemas.signals import (
     encode_info,
     location_class,
 )
-from schemas.topics import Message, check_realm
+from schemas.topics import Message
 from services.bus.credentials import check_speaks_for
 from services.bus.playback import (
     GAP_S,
@@ -39,7 +39,7 @@ from services.bus.playback import (
     publish_paced,
     stopped_by_signals,
 )
-from services.bus.session import open_session
+from services.bus.session import checked_realm, open_session
 from services.common.errors import InputError
 from services.recordings.recording import check_message, read_messages
 from services.truck.gateway import Connect, Gateway
@@ -74,7 +74,7 @@ def run(asked: TruckSettings, *, connect_timeout_s: float | None = CONNECT_TIMEO
     messages), or the logger did not confirm everything.
     """
     check_speed(asked.speed)
-    realm = _checked_realm(asked.realm)
+    realm = checked_realm(asked.realm)
     streams = _read_vehicle(asked.recording, asked.vehicle, asked.site)
     vehicle = next(iter(streams.values()))[0].key.identifier
     check_speaks_for(asked.tls, "truck", vehicle)
@@ -109,13 +109,6 @@ def run(asked: TruckSettings, *, connect_timeout_s: float | None = CONNECT_TIMEO
                 sent, gateway.vehicle, asked.address,
             )  # fmt: skip
     return 0
-
-
-def _checked_realm(realm: str) -> str:
-    try:
-        return check_realm(realm)
-    except ValueError as error:
-        raise InputError(str(error)) from None
 
 
 def _publish(

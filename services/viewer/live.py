@@ -25,10 +25,10 @@ from schemas.site_file import load_site
 from services.bus.playback import leave_at_once, stopped_by_signals
 from services.bus.realm_listener import (
     RealmListener,
-    check_listenable,
     open_listener,
     other_realms_hint,
 )
+from services.bus.session import checked_realm
 from services.common.errors import FailureError, InputError
 from services.viewer.live_layout import WAITING, waiting_blueprint
 from services.viewer.live_view import LiveView
@@ -60,7 +60,7 @@ def live_command(asked: ViewSettings, print_line: Callable[[str], None]) -> int:
     the viewer is absent or fails.
     """
     realm, show, address = asked.realm, asked.show, asked.listen
-    check_listenable(realm)
+    checked_realm(realm)
     known = None if asked.site is None else load_site(asked.site)
     _check_address(address)
     chosen = _free_port(address, asked.port)

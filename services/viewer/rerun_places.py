@@ -48,34 +48,26 @@ _NAME_ABOVE = 0.13
 
 
 class BridgeOnMap(NamedTuple):
-    """Position of a bridge; its ends are (latitude, longitude) in degrees."""
+    """Position of a bridge."""
 
     identifier: str
-    start: tuple[float, float]
-    end: tuple[float, float]
+    start_latitude_deg: float
+    start_longitude_deg: float
+    end_latitude_deg: float
+    end_longitude_deg: float
     edges_m: tuple[float, ...]
     """Chainage of the n + 1 ends of its elements."""
     supports_m: tuple[float, ...]
 
     @property
-    def start_latitude_deg(self) -> float:
-        """Latitude of the start; with the three below, the ends for a frame."""
-        return self.start[0]
+    def start(self) -> tuple[float, float]:
+        """Latitude and longitude of the start."""
+        return self.start_latitude_deg, self.start_longitude_deg
 
     @property
-    def start_longitude_deg(self) -> float:
-        """Longitude of the start."""
-        return self.start[1]
-
-    @property
-    def end_latitude_deg(self) -> float:
-        """Latitude of the end."""
-        return self.end[0]
-
-    @property
-    def end_longitude_deg(self) -> float:
-        """Longitude of the end."""
-        return self.end[1]
+    def end(self) -> tuple[float, float]:
+        """Latitude and longitude of the end."""
+        return self.end_latitude_deg, self.end_longitude_deg
 
     @property
     def span_m(self) -> float:
@@ -88,8 +80,10 @@ def bridges_of_site(site: Site) -> list[BridgeOnMap]:
     return [
         BridgeOnMap(
             bridge.id,
-            (bridge.start_latitude_deg, bridge.start_longitude_deg),
-            (bridge.end_latitude_deg, bridge.end_longitude_deg),
+            bridge.start_latitude_deg,
+            bridge.start_longitude_deg,
+            bridge.end_latitude_deg,
+            bridge.end_longitude_deg,
             (0.0, *np.cumsum(bridge.lengths_m).tolist()),
             (0.0, *bridge.interior_supports_m, bridge.span_m),
         )

@@ -38,7 +38,7 @@ from services.logger.settings import LoggerSettings
 from services.logger.writer import FileWriter
 from services.recordings.recording import is_closed, read_info, read_messages
 from services.recordings.recovery import recover_recording
-from tests.waiting import LONGEST_S
+from tests.waiting import LONGEST_S, until
 
 NOW_NS = 1_700_000_000_000_000_000
 
@@ -58,13 +58,6 @@ def fixes(number: int, vehicle: str = "truck-1", *, first: int = 0) -> Iterator[
 def info(vehicle: str) -> Message:
     payload = encode_info(VehicleInfo(1, 0, 0, NOW_NS, vehicle, '[vehicle]\nid = "x"\n'))
     return Message(Key("live", "vehicle", vehicle, "info"), payload, 1, 0, NOW_NS, NOW_NS)
-
-
-def wait_for(condition: Callable[[], object], timeout_s: float = LONGEST_S) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 def data_of(paths: Iterable[Path]) -> list[Message]:
@@ -130,7 +123,7 @@ def test_a_disk_that_stalls_for_10_s_loses_nothing_of_100_trucks(tmp_path: Path)
         return number
 
     sent = send(range(2))
-    wait_for(lambda: writer.take_figures()["files"] == 100)
+    until(lambda: writer.take_figures()["files"] == 100)
     go.clear()
     sent += send(range(2, 4))
     assert stalled.wait(LONGEST_S)
@@ -168,7 +161,7 @@ def test_a_longer_stall_is_counted_and_takes_no_more_memory(tmp_path: Path, limi
     assert not writer.has_room(100)
     assert writer.put(next(fixes(1, "truck-2")), always=True)
     go.set()
-    wait_for(lambda: writer.has_room(100))
+    until(lambda: writer.has_room(100))
     writer.finish("done", {"dropped": writer.dropped})
     assert len(data_of(tmp_path.glob("live/*/*.mcap"))) == taken.count(True) + 1
 
@@ -340,16 +333,16 @@ def test_low_space_is_reported_and_ends_recording_early(
     sent = list(fixes(20))
     for message in sent[:10]:
         writer.put(message)
-    wait_for(lambda: writer.written == 10)
+    until(lambda: writer.written == 10)
     assert not writer.room.is_low
     room = 700_000
-    wait_for(lambda: writer.unpublished)
+    until(lambda: writer.unpublished)
     assert writer.room.is_low
     for message in sent[10:]:
         writer.put(message)
-    wait_for(lambda: writer.written == 21)  # with the event
+    until(lambda: writer.written == 21)  # with the event
     room = 99_000
-    wait_for(lambda: writer.failure is not None)
+    until(lambda: writer.failure is not None)
     assert writer.failure == f"recording stopped: only 0 MB left on the disk of {tmp_path}"
     writer.finish("done", {})
     assert writer.dropped == 0
@@ -447,7 +440,7 @@ def test_a_truck_that_is_quiet_gets_a_new_file_when_it_comes_back(
     writer = FileWriter(place(tmp_path))
     writer.put(info("truck-1"))
     writer.put(next(fixes(1)))
-    wait_for(lambda: writer.written == 2 and writer.take_figures()["files"] == 0)
+    until(lambda: writer.written == 2 and writer.take_figures()["files"] == 0)
     writer.put(next(fixes(1, first=1)))
     writer.finish("done", {})
     paths = list(tmp_path.glob("live/*/*.mcap"))

@@ -1,7 +1,6 @@
 """Recordings that are deleted, cut or moved while the logger writes them."""
 
 import os
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from schemas.topics import Key, Message
 from services.logger.file_layout import RecordingTarget
 from services.logger.writer import FileWriter
 from services.recordings.recording import read_info, read_messages
-from tests.waiting import LONGEST_S
+from tests.waiting import LONGEST_S, until
 
 NOW_NS = 1_700_000_000_000_000_000
 
@@ -28,13 +27,6 @@ def fix(sequence: int) -> Message:
 def info() -> Message:
     payload = encode_info(VehicleInfo(1, 0, 0, NOW_NS, "truck-1", ""))
     return Message(Key("live", "vehicle", "truck-1", "info"), payload, 1, 0, NOW_NS, NOW_NS)
-
-
-def wait_for(condition: Callable[[], object], timeout_s: float = LONGEST_S) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def events_of(paths: list[Path]) -> list[Event]:
@@ -76,13 +68,13 @@ def test_what_was_in_a_file_that_is_gone_is_not_called_durable(
 
     for message in (info(), *(fix(n) for n in range(100))):
         writer.put(message)
-    wait_for(lambda: writer.written == 101)
+    until(lambda: writer.written == 101)
     [path] = folder.glob("live/*/*.mcap")
     harm(path)
-    wait_for(lambda: writer.unpublished)
+    until(lambda: writer.unpublished)
     for sequence in range(100, 150):
         writer.put(fix(sequence))
-    wait_for(lambda: (found := durable()) and found.count in (50, 150))
+    until(lambda: (found := durable()) and found.count in (50, 150))
     found = durable()
     writer.finish("done", {})
     assert writer.failure is None

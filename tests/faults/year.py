@@ -23,6 +23,7 @@ import numpy as np
 from schemas.results import CrossingResult, results_json
 from services.cli import main as cli
 from services.common.files import make_folder, write_atomically
+from services.common.language import utc_day
 from services.execution.blas import one_blas_thread
 from services.history.alarm_files import acknowledge, alarms_of
 from services.history.alarms import AlarmSettings, check
@@ -92,11 +93,11 @@ def year(out: Path, seed: int, weeks: int = WEEKS) -> int:
         if not _done([*words, "--temperature", str(station)]):
             return 1
         for alarm in check(history, AlarmSettings(), monday_s).raised:
-            print(f"{_day(monday_s)}  {alarm.bridge}: {alarm.sentence()}")
+            print(f"{utc_day(monday_s)}  {alarm.bridge}: {alarm.sentence()}")
             if alarm.bridge == REPAIRED and alarm.direction == "stiffer":
                 noted_s = monday_s + 2.0 * WEEK_S
                 acknowledge(history, alarm, "owner", "element 5 was strengthened in May", noted_s)
-                print(f"{_day(noted_s)}  {alarm.bridge}: acknowledged by its owner")
+                print(f"{utc_day(noted_s)}  {alarm.bridge}: acknowledged by its owner")
     print(f"{number} crossings of {BRIDGES} bridges by {TRUCKS} trucks in {weeks} weeks")
     for name in (WEAKENS, REPAIRED, "bridge-01"):
         words = ["history", name, "--history", str(history), "--period", "week"]
@@ -163,10 +164,6 @@ def _weather(rng: np.random.Generator, weeks: int) -> list[tuple[float, float]]:
         noon = -3.0 * float(np.cos(2.0 * np.pi * (hour / 24.0 - 3.0 / 24.0)))
         out.append((time_s, season_deg_c(time_s) + day + noon))
     return out
-
-
-def _day(time_s: float) -> str:
-    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from services.security.settings import CertsSettings
 from services.truck.gateway import Gateway
 from services.truck.spool import Spool
 from tests.builders.commands import run
+from tests.builders.processes import stop
 from tests.waiting import LONGEST_S, until
 
 pytestmark = pytest.mark.process
@@ -111,12 +112,6 @@ def test_unlisted_truck_fails_named_and_its_spool_keeps_everything(
             *("logger", "--listen", tls_endpoint, "--tls", listener, "--folder", tmp_path / "r")
         )
 
-    def end(process: subprocess.Popen[str]) -> str:
-        process.send_signal(signal.SIGTERM)
-        _, log = process.communicate(timeout=LONGEST_S)
-        assert process.returncode == 0, log
-        return log
-
     first = logger(lacking / "logger")
     truck = driveby(
         *("truck", recording, "--speed", 50, "--spool", tmp_path / "spool"),
@@ -130,7 +125,7 @@ def test_unlisted_truck_fails_named_and_its_spool_keeps_everything(
         "the spool keeps the messages"
     )
     where = lacking / "logger" / "zenoh.json5"
-    assert end(first).count(f"truck/truck-1 is connected and not listed in {where}") == 1
+    assert stop(first).count(f"truck/truck-1 is connected and not listed in {where}") == 1
     assert not identities(tmp_path / "r")
     second = logger(credentials / "logger")
     with open_session(
@@ -139,7 +134,7 @@ def test_unlisted_truck_fails_named_and_its_spool_keeps_everything(
         gateway = Gateway(session, "live", "truck-1", Spool(tmp_path / "spool"))
         until(lambda: len(set(identities(tmp_path / "r"))) == 401, "the first drive")
         gateway.close()
-    assert "not listed" not in end(second)
+    assert "not listed" not in stop(second)
 
 
 def test_a_crossing_is_identified_under_access_control(

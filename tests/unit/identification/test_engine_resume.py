@@ -76,6 +76,11 @@ def fed(one: WorkingEngine, messages: Iterable[Message]) -> list[Output]:
     return [output for m in messages for output in one.feed(m.key, m.payload)]
 
 
+def until(time_s: float) -> list[Message]:
+    """Return what a truck has sent by then."""
+    return [m for m in TWO if m.log_time_ns * 1e-9 - START_S < time_s]
+
+
 def said_by(outputs: Iterable[Output]) -> EngineOutput:
     return [(output.key, output.payload) for output in outputs]
 

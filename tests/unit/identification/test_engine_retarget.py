@@ -10,7 +10,14 @@ from schemas.validation_records import VehicleBridgePair
 from services.identification.bridge_state import NOTHING_STORED
 from services.identification.outputs import Output, ValidationRequest
 from tests.unit.identification.test_engine_certificates import DIGEST, ONE, OTHER, PAIR, Asking
-from tests.unit.identification.test_engine_resume import HEADER, SITE, START_S, TWO, bridge_states
+from tests.unit.identification.test_engine_resume import (
+    HEADER,
+    SITE,
+    START_S,
+    TWO,
+    bridge_states,
+    until,
+)
 
 EDITED = SITE.model_copy(
     update={
@@ -24,10 +31,6 @@ EDITED = SITE.model_copy(
     }
 )
 """Another bridge comes before it, and truck and bridge have changed."""
-
-
-def until(time_s: float) -> list[Message]:
-    return [m for m in TWO if m.log_time_ns * 1e-9 - START_S < time_s]
 
 
 def after(time_s: float) -> list[Message]:

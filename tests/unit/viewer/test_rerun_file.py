@@ -367,7 +367,13 @@ def test_absent_channels_stay_absent() -> None:
 
 def test_only_bridges_that_fit_on_the_map_of_the_track_are_on_it(site: Site) -> None:
     (near,) = bridges_of_site(site)
-    far = near._replace(identifier="far", start=(37.9, -122.3), end=(37.9, -122.299))
+    far = near._replace(
+        identifier="far",
+        start_latitude_deg=37.9,
+        start_longitude_deg=-122.3,
+        end_latitude_deg=37.9,
+        end_longitude_deg=-122.299,
+    )
     signals = VehicleSignals([], gnss())
     assert bridges_near_tracks([far, near], [signals]) == [near]
     assert bridges_near_tracks([far, near], [VehicleSignals([], [])]) == [far, near]

@@ -36,6 +36,7 @@ from tests.unit.identification.test_engine_resume import (
     WHOLE,
     EngineOutput,
     said_by,
+    until,
 )
 
 DAY_S = 86_400.0
@@ -235,11 +236,6 @@ def test_a_truck_lost_on_the_bridge_gives_one_result(
     assert IDS[0] not in found
     assert len(found) == 1  # the next crossing
     assert worker.go_on() == []
-
-
-def until(time_s: float) -> list[Message]:
-    """What a truck has sent by then."""
-    return [m for m in TWO if m.log_time_ns * 1e-9 - START_S < time_s]
 
 
 def restarted(message: Message) -> Message:
