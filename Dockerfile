@@ -88,7 +88,9 @@ RUN NUMBA_CACHE_DIR=/app/kernels /app/entrypoint.sh python -m driveby.services.e
 USER driveby
 
 FROM service AS view
+# Matplotlib would write its list of fonts to the home folder, which is read-only.
+ENV MPLCONFIGDIR=/tmp/matplotlib
 USER root
 COPY --from=view-environment /new /
-RUN python -c "import driveby.services.viewer.rerun_file" && rm -rf /tmp/kernels
+RUN python -c "import driveby.services.viewer.rerun_file" && rm -rf /tmp/kernels /tmp/matplotlib
 USER driveby

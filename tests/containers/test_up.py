@@ -189,7 +189,8 @@ def test_view_draws_and_reports(up: Stack, taken: Path, tmp_path: Path) -> None:
     up.compose("build", "view")
     size = int(up.docker("image", "inspect", "-f", "{{.Size}}", "driveby-view").out) / 1e6
     print(f"\ndriveby-view: {size:.0f} MB")
-    up.compose("run", "--rm", "view")
+    drawn = up.compose("run", "--rm", "view")
+    assert "WARNING" not in drawn.out + drawn.err, drawn
     [results] = taken.rglob("results-*.json")
     of_results = f"recordings/{results.relative_to(taken)}"
     up.compose("run", "--rm", "view", "report", of_results, "--output", "recordings/report.html")
