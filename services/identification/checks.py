@@ -70,6 +70,9 @@ sensors' noise. Dry friction and nonlinear dampers: -0.13 to 0.28; tilted sensor
 shakes above 2 Hz: 0.95 to 0.97."""
 _COARSE = 1.4
 """Quantisation noise, relative to the declared noise, above which a converter is named."""
+_EXCITED = 3.0
+"""RMS of an acceleration, relative to the declared noise, above which the road excites the truck:
+12 on a road fifty times smoother than class A, 1.7 on a flat one."""
 _STIFFER = 1.5
 """Ratio of an element's EI to its nominal value, and to the other elements, that only wrong signals
 exceed. Ageing and an inaccurate nominal value change it by less."""
@@ -186,6 +189,24 @@ def coarse_converters(
         if step / np.sqrt(12.0) > _COARSE * declared:
             found.append(f"{name} in steps of {step:.2g} m/s²")
     return ", ".join(found)
+
+
+def weak_excitation(
+    density_ug_per_rthz: tuple[float, ...], acceleration: Floats, step_s: float
+) -> str:
+    """Return a clause if all channels (4, n) hardly exceed their declared noise, or "".
+
+    Then the road excites the truck too little to tell a step of a gain from chance.
+    """
+    declared = np.array(density_ug_per_rthz) * MICRO_G_M_PER_S2 * np.sqrt(0.5 / step_s)
+    largest = float(np.max(np.std(acceleration, axis=1) / np.maximum(declared, 1e-12)))
+    if largest > _EXCITED:
+        return ""
+    return (
+        f"but the RMS of all accelerations is at most {largest:.2g} times the sensors' noise: the "
+        "road hardly excites the truck, and the step may be chance; drive faster, or use quieter "
+        "sensors"
+    )
 
 
 def _speeds_differ(data: CrossingData, fit: Fit) -> bool:

@@ -29,6 +29,7 @@ from services.identification.checks import (
     reasons_after_fit,
     steps_of_channels,
     undeclared_axles,
+    weak_excitation,
 )
 from services.identification.result_parts import Floats
 
@@ -64,6 +65,9 @@ def reasons_of_fit(
     reasons = [*slipped, *reasons]
     if found.ending is not Termination.CONVERGED:
         reasons.append(Reason.NOT_CONVERGED)
+    unexcited = weak_excitation(densities, acceleration, step_s) if slipped else ""
+    if unexcited:
+        slipped = {reason: f"{text}, {unexcited}" for reason, text in slipped.items()}
     axles = undeclared_axles(data.vehicle, acceleration, step_s, is_doubted=bool(reasons))
     coarse = coarse_converters(names, densities, acceleration, step_s)
     if (coarse or found.noise_power > 1.0) and Reason.NOISE_ABOVE_DECLARED not in reasons:

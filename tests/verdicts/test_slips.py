@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+import driveby
 from pre_core.crossing import slip
 from pre_core.crossing.channels import A_1, A, V, Z
 from schemas.reasons import Reason
@@ -63,6 +64,29 @@ def test_changed_gain_is_named(factor: float) -> None:
     assert result.verdict == "rejected"
     assert Reason.GAIN_CHANGED in result.reasons
     assert U1 in result.reason_texts[result.reasons.index(Reason.GAIN_CHANGED)]
+
+
+def test_missing_excitation_is_stated_next_to_a_step() -> None:
+    """A flat road excites the truck no more than the sensors' noise is: 5.5 mm/s² at 1 kHz."""
+    noise = np.random.default_rng(1).standard_normal((4, 5000))
+    densities, step_s = (25.0,) * 4, 1e-3
+    said = checks.weak_excitation(densities, 1.7 * 5.48e-3 * noise, step_s)
+    assert said.startswith(
+        "but the RMS of all accelerations is at most 1.7 times the sensors' noise"
+    )
+    louder = 5.48e-3 * noise * np.array([[1.0], [1.0], [1.0], [4.0]])
+    assert checks.weak_excitation(densities, louder, step_s) == ""
+    assert checks.weak_excitation((0.0,) * 4, louder, step_s) == ""
+
+
+@pytest.mark.slow
+def test_flat_road_is_rejected_for_missing_excitation() -> None:
+    flat = driveby.simulate(
+        scenario=6, noise=25.0, gps_noise=True, seed=2, road=([-200.0, 300.0], [0.0, 0.0])
+    )
+    (solution,) = driveby.identify(flat).solutions
+    assert solution.verdict == "rejected"
+    assert "the road hardly excites the truck" in " ".join(solution.crossing.reason_texts)
 
 
 @pytest.mark.parametrize("rate_hz", [pytest.param(200.0, marks=pytest.mark.slow), 1000.0])
