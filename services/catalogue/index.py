@@ -21,7 +21,7 @@ from services.catalogue.row import CatalogRow, details_text, file_sha256, row_of
 from services.common.errors import FailureError, InputError
 from services.common.extras import check_extras
 from services.common.files import is_unicode
-from services.common.parquet_files import decoded, encoded
+from services.common.parquet_files import arrow, decoded, encoded
 from services.common.stores import (
     Entry,
     Folder,
@@ -238,7 +238,7 @@ def _name(ordered: list[CatalogRow], number: int) -> str:
 
 
 def _file_of(rows: list[CatalogRow]) -> bytes:
-    import pyarrow as pa
+    pa = arrow()
 
     boxes = [row.box for row in rows]
     table = pa.table(

@@ -28,6 +28,7 @@ from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
 from services.common.files import check_kind, is_unicode, name_error
 from services.common.log_lines import configure_logging
 from services.common.outputs import declared
+from services.common.parquet_files import spare_pandas
 
 _OBJECTS_BETWEEN_LOOKS: Final = 20_000
 _SERVICES: Final = ("logger", "worker", "truck", "gateway", "cluster")
@@ -145,6 +146,7 @@ def program() -> int:
     The last search for reference cycles at the end of Python is skipped: 0.15 s. It is not where a
     library counts remaining objects at the very end, and prints a line for each.
     """
+    spare_pandas()
     code = main()
     if not any(name in sys.modules for name in _COUNTS_AT_EXIT):
         gc.freeze()

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from schemas.results import CrossingResult, ResultHeader, Results, load_results, results
 from services.common.errors import InputError
 from services.common.files import check_ordinary, make_folder, write_atomically
-from services.common.parquet_files import FILES, ReadLimits, decoded, encoded
+from services.common.parquet_files import FILES, ReadLimits, arrow, decoded, encoded
 from services.execution.task_hash import combined_hash
 from services.identification.bridge_state import with_common_shares
 from services.identification.known import search_hash
@@ -261,7 +261,7 @@ def _line_of(path: Path, row: int, error: Exception) -> str:
 
 
 def _file_of(found: list[StoredResult], header: ResultHeader) -> bytes:
-    import pyarrow as pa
+    pa = arrow()
 
     crossings = [one.crossing for one in found]
     head = zstandard.compress(results(header, [], {}).model_dump_json().encode())

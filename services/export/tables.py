@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from schemas.signals import NS_PER_S
 from services.common.files import replaced_atomically, write_atomically
+from services.common.parquet_files import arrow
 
 Format = Literal["csv", "parquet"]
 Column = Sequence[Any] | NDArray[Any]
@@ -57,9 +58,9 @@ def _cells(name: str, column: Column) -> list[Any]:
 
 
 def _write_parquet(path: Path, table: NamedTable) -> None:
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
+    pa = arrow()
     columns = {}
     for name, column in table.columns.items():
         if name.endswith("_ns"):

@@ -26,7 +26,7 @@ from schemas.results import CrossingResult, ElementState, ResultHeader, Results
 from schemas.topics import check_identifier, check_realm
 from services.common.errors import InputError
 from services.common.files import make_folder, write_atomically
-from services.common.parquet_files import FILES, decoded, encoded
+from services.common.parquet_files import FILES, arrow, decoded, encoded
 
 if TYPE_CHECKING:
     # Kernels are slow to import, and reading a table needs none.
@@ -375,7 +375,7 @@ def unpacked_observation(content: bytes) -> "Observation":
 
 
 def _table(rows: list[HistoryRow]) -> "pa.Table":
-    import pyarrow as pa
+    pa = arrow()
 
     columns: dict[str, Any] = {name: [getattr(row, name) for row in rows] for name in _PLAIN}
     columns["reasons"] = pa.array([list(row.reasons) for row in rows], pa.list_(pa.string()))
