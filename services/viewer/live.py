@@ -30,6 +30,7 @@ from services.bus.realm_listener import (
 )
 from services.bus.session import checked_realm
 from services.common.errors import FailureError, InputError
+from services.common.parquet_files import arrow
 from services.viewer.live_layout import WAITING, waiting_blueprint
 from services.viewer.live_view import LiveView
 from services.viewer.rerun_parts import log_markdown
@@ -66,6 +67,7 @@ def live_command(asked: ViewSettings, print_line: Callable[[str], None]) -> int:
     chosen = _free_port(address, asked.port)
     if show is not None:
         prepare_viewer(window=show == "window")
+    arrow()  # before Rerun's first list
     with (
         stopped_by_signals(leave_at_once) as stop,
         rr.RecordingStream(APPLICATION) as recording,

@@ -20,6 +20,7 @@ from matplotlib.image import imread
 from schemas.results import CrossingResult
 from schemas.site import Site
 from services.common.files import replaced_atomically
+from services.common.parquet_files import arrow
 from services.common.progress import Steps, no_step_progress
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.bridge_view import BridgeView, describe_bridge, origin_of
@@ -110,6 +111,7 @@ def write_rrd(path: Path, content: RerunContent, drawing: Steps = no_step_progre
     fewer channels, is drawn with those it has. `drawing` is called for each crossing, and each
     block of accelerations.
     """
+    arrow()  # before Rerun's first list
     vehicles, _, site, overviews, _, passings, about = content
     crossings, bridges = content.views(), [] if site is None else bridges_of_site(site)
     near = bridges_near_tracks(bridges, vehicles.values())
