@@ -1,5 +1,6 @@
-"""The wheel of the working tree."""
+"""Source archive and wheel of the working tree."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -18,11 +19,21 @@ def sources(project: Path, folder: Path) -> Path:
     return folder
 
 
-def built(project: Path, folder: Path) -> Path:
-    """Return the wheel after building it in an empty folder."""
-    source = sources(project, folder)
-    # As pip does, which starts further processes to ask what the build needs.
-    build = "from setuptools import build_meta; build_meta.build_wheel('dist')"
-    subprocess.run([sys.executable, "-c", build], cwd=source, check=True, capture_output=True)
-    (found,) = (source / "dist").glob("*.whl")
-    return found
+def distribution(project: Path, folder: Path, modified_s: float, mode: int, umask: int) -> Path:
+    """Return the folder with the source archive, and the wheel built from it.
+
+    The sources have a time of change and a mode, and are built under a mask, of their own.
+    """
+    source = sources(project, folder / "source")
+    for path in source.rglob("*"):
+        os.utime(path, (modified_s, modified_s))
+        path.chmod(0o755 if path.is_dir() else mode)
+    script = project / "docs" / "scripts" / "distribution.py"
+    subprocess.run(
+        [sys.executable, script, source, folder / "out"],
+        env=os.environ | {"SOURCE_DATE_EPOCH": "1750000000"},
+        umask=umask,
+        check=True,
+        capture_output=True,
+    )
+    return folder / "out"

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from tests.builders.wheels import INNER, sources
+from tests.builders.wheels import INNER, distribution
 
 LARGEST_TRUCK_MB = 120.0
 """Site-packages of a truck's computer, without compiled bytecode."""
@@ -81,25 +81,12 @@ def test_tests_can_be_run_against_the_wheel(built: dict[str, Any], project: Path
 
 
 @pytest.fixture(scope="module")
-def distributions(project: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def distributions(
+    first_distribution: Path, project: Path, tmp_path_factory: pytest.TempPathFactory
+) -> list[Path]:
     """Two builds of the same sources, in checkouts of other times and modes."""
-    found = []
-    for modified_s, mode, umask in ((1e9, 0o664, 0o002), (1.5e9, 0o600, 0o077)):
-        folder = tmp_path_factory.mktemp("distribution")
-        source = sources(project, folder / "source")
-        for path in source.rglob("*"):
-            os.utime(path, (modified_s, modified_s))
-            path.chmod(0o755 if path.is_dir() else mode)
-        script = project / "docs" / "scripts" / "distribution.py"
-        subprocess.run(
-            [sys.executable, script, source, folder / "out"],
-            env=os.environ | {"SOURCE_DATE_EPOCH": "1750000000"},
-            umask=umask,
-            check=True,
-            capture_output=True,
-        )
-        found.append(folder / "out")
-    return found
+    folder = tmp_path_factory.mktemp("second")
+    return [first_distribution, distribution(project, folder, 1.5e9, 0o600, 0o077)]
 
 
 def test_two_builds_give_the_same_bytes(distributions: list[Path]) -> None:
