@@ -165,14 +165,16 @@ class Faults:
         template = "{{range $name, $_ := .NetworkSettings.Networks}}{{$name}} {{end}}"
         return self._stack.docker("inspect", "-f", template, name).out.split()
 
-    def plan(self, number: int, services: list[str]) -> Iterator[tuple[str, str, float]]:
-        """Yield faults: every service and kind in turn, for one to thirty seconds."""
+    def plan(
+        self, number: int, services: list[str], longest_s: float = 30.0
+    ) -> Iterator[tuple[str, str, float]]:
+        """Yield faults: every service and kind in turn, for one second to the longest time."""
         kinds = ("kill", "pause", "cut off")
         every = [(service, how) for service in services for how in kinds]
         self._random.shuffle(every)
         for n in range(number):
             service, how = every[n % len(every)]
-            yield service, how, self._random.uniform(1.0, 30.0)
+            yield service, how, self._random.uniform(1.0, longest_s)
 
     def pause_before(self, most_s: float) -> None:
         time.sleep(self._random.uniform(0.0, most_s))

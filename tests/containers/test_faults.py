@@ -1,7 +1,8 @@
 """Containers are killed, paused and cut off at random moments while trucks drive.
 
-FAULTS=20 SEED=1 give their number and moments. Every message that a truck has accepted is recorded
-once, and every crossing that a truck has driven to its end has one result.
+FAULTS=20 SEED=1 LONGEST_S=30 give their number, moments and longest time. Every message that a
+truck has accepted is recorded once, and every crossing that a truck has driven to its end has one
+result.
 """
 
 import os
@@ -28,9 +29,10 @@ def test_nothing_is_lost_nothing_twice_and_one_result_for_each_crossing(
     stack: Stack, folder: Path
 ) -> None:
     number, seed = int(os.environ.get("FAULTS", "20")), int(os.environ.get("SEED", "1"))
+    longest_s = float(os.environ.get("LONGEST_S", "30"))
     stack.make("up")
     faults = Faults(stack, seed)
-    for service, how, seconds in faults.plan(number, STRUCK):
+    for service, how, seconds in faults.plan(number, STRUCK, longest_s):
         if stack.has_ended("truck"):
             stack.docker("start", stack.name("truck"))
         faults.pause_before(15.0)
