@@ -196,7 +196,7 @@ def weak_excitation(
 ) -> str:
     """Return a clause if all channels (4, n) hardly exceed their declared noise, or "".
 
-    Then the road excites the truck too little to tell a step of a gain from chance.
+    Then the road excites the truck too little to distinguish a step from chance.
     """
     declared = np.array(density_ug_per_rthz) * MICRO_G_M_PER_S2 * np.sqrt(0.5 / step_s)
     largest = float(np.max(np.std(acceleration, axis=1) / np.maximum(declared, 1e-12)))
