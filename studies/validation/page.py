@@ -21,14 +21,14 @@ from studies.validation.worlds import HEADINGS, cells, lines_of
 
 _HEAD = """# Validation of method `pre`
 
-Is the uncertainty true? This page is written by
+Are the intervals reliable? This page is written by
 
     {command} --page docs/validation.md
 
 (`make validate`: 200 crossings, 64 of each effect); every figure on it comes from that run. No
 real bridge is among them: no public record of one is known.
 
-## The aims
+## Targets
 
 {aims}
 """
@@ -198,7 +198,7 @@ def _worlds(records: Sequence[Record]) -> str:
 
 
 def _aims(checks: list[Aim]) -> str:
-    rows = ["| aim | measured | wanted | |", "| --- | --: | --: | --- |"]
+    rows = ["| target | measured | wanted | |", "| --- | --: | --: | --- |"]
     for check in checks:
         measured = "none" if check.measured is None else f"{check.measured:.3g}"
         note = f" ({check.note})" if check.note else ""

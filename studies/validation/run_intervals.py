@@ -133,7 +133,7 @@ def print_outcome(console: "Console", outcome: ValidationOutcome, all_checks: li
         )
     if outcome.judged_from is None:
         console.print("no crossings of an independent simulator here: that part is left out")
-    shown = table("aim", "measured", "from", "to", "")
+    shown = table("target", "measured", "from", "to", "")
     for check in all_checks:
         measured = "none" if check.measured is None else f"{check.measured:.3f}"
         style = None if check.is_met else "bold red"

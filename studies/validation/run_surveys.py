@@ -54,7 +54,7 @@ def run(asked: SurveyOptions, console: "Console") -> int:
         if not check.is_met:
             measured = "none" if check.measured is None else f"{check.measured:.2f}"
             console.print(
-                f"missed: {check.name} {measured}, {check.low:g} to {check.high:g} was aimed at",
+                f"missed: {check.name} {measured}, {check.low:g} to {check.high:g} was the target",
                 highlight=False,
             )
     return 0 if all(check.is_met for check in checks) else 1

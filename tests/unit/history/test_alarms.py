@@ -176,8 +176,8 @@ def test_a_year_passes_before_an_unknown_season_is_judged(tmp_path: Path) -> Non
     assert (found.state, found.sentence) == (
         "season",
         (
-            "Not monitored yet: temperatures are unknown, so the season is learned for a year, "
-            "until 2026-01-05."
+            "Not monitored yet: temperatures are unknown, so the seasonal effect is estimated for "
+            "a year, until 2026-01-05."
         ),
     )
 

@@ -190,7 +190,7 @@ def test_one_month_is_nothing_to_compare_with(
     assert capsys.readouterr().out.splitlines()[-2:] == [
         "Not monitored: driveby alarm check has not been run on this bridge.",
         (
-            "A change cannot be seen yet: fewer than two months have good crossings that can be "
+            "A change cannot be detected yet: fewer than two months have good crossings that can be "
             "compared."
         ),
     ]

@@ -676,7 +676,7 @@ def test_a_measurement_that_could_have_missed_a_loss_does_not_reassure(
     assert 10 < int(seen[0]) <= int(seen[1])
     assert int(seen[1]) > 20
     assert "Do not omit or postpone an inspection because of this measurement" in found.text
-    assert "Whoever plans the drives runs driveby survey: it computes" in found.text
+    assert "Plan the drives with driveby survey: it computes" in found.text
     assert "equalised tandem" in found.text
     assert "no additional inspection" not in found.text
     german = reported(site, sound, language="de").text
@@ -701,7 +701,7 @@ def test_elements_that_cannot_be_compared_are_not_called_sound(site: Site) -> No
     alone = view._replace(finding=found, view=view.view._replace(comparison=None))
     steps = " ".join(next_steps(alone, ENGLISH))
     assert "Do not omit or postpone an inspection" in steps
-    assert "Drive over the bridge more often" not in steps
+    assert "Cross the bridge more often" not in steps
 
 
 def test_suspect_crossings_that_were_not_used_are_not_called_nothing(site: Site) -> None:
@@ -801,7 +801,7 @@ def test_of_a_rejected_crossing_stands_what_to_do_next(site: Site) -> None:
     assert f"there are no usable values. {said}" in text
     what = text.partition("What to do next")[2].partition("What this does not mean")[0]
     assert "Check the wiring of these sensors." in what
-    assert "the crew of the truck drives a minute on any road and runs driveby check REC" in what
+    assert "drive the truck for a minute on any road and run driveby check REC" in what
     assert "Carry out the inspections that are due as if nothing had been measured" in what
 
 
