@@ -51,7 +51,7 @@ def read_toml_text(path: Path, what: str) -> str:
     try:
         # A pipe or a device may never end or never begin, so check before opening.
         if not stat.S_ISREG(path.stat().st_mode) and not path.is_dir():
-            raise InputError(f"{path}: is no ordinary file, {expected}")
+            raise InputError(f"{path}: is not an ordinary file, {expected}")
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
     except FileNotFoundError as error:

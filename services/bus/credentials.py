@@ -123,7 +123,7 @@ def read_certificate(path: Path) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(content)
     except ValueError:
-        raise InputError(f"{path}: is no certificate in PEM form") from None
+        raise InputError(f"{path}: is not a certificate in PEM format") from None
 
 
 def hosts_of(certificate: x509.Certificate) -> list[str]:
@@ -174,7 +174,7 @@ def _check_key(path: Path, certificate: x509.Certificate) -> None:
     try:
         key = load_pem_private_key(content, password=None)
     except (ValueError, TypeError):
-        raise InputError(f"{path}: is no private key in PEM form without a password") from None
+        raise InputError(f"{path}: is not a private key in PEM format without a password") from None
     form = (Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
     if key.public_key().public_bytes(*form) != certificate.public_key().public_bytes(*form):
         raise InputError(f"{path}: is not the key of {CERTIFICATE} next to it")

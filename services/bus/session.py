@@ -103,7 +103,7 @@ def open_session(
     if listen is not None and tls is None and not insecure and not _is_on_this_machine(listen):
         raise InputError(
             f"{listen} can be reached by other machines, and without --tls FOLDER anybody there "
-            "could publish as a truck; say --insecure if that is wanted (see docs/security.md)"
+            "could publish as a truck; add --insecure if that is intended (see docs/security.md)"
         )
     if listen is not None:
         os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)  # read at a process's first session

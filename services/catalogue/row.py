@@ -63,14 +63,14 @@ def row_of(folder: Folder, entry: Entry) -> CatalogRow:
         if index is None:
             raise InputError(
                 f"{where}: has no index: it is being written, or was cut off "
-                "(driveby recover makes it whole)"
+                "(driveby recover repairs it)"
             )
         builder = _RowBuilder()
         try:
             for key, boot_id, message in _messages(where, file, index):
                 builder.add(key, boot_id, message)
         except ValueError as error:
-            raise InputError(f"{where}: {error} (driveby recover makes it whole)") from None
+            raise InputError(f"{where}: {error} (driveby recover repairs it)") from None
         if not builder.messages:
             raise InputError(f"{where}: holds no driveby message; a recording is expected")
         content = file_sha256(file)

@@ -173,9 +173,9 @@ def _new_folder(out: Path | None) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=False)
     except FileExistsError:
-        raise InputError(f"{folder}: exists, the demo wants a new folder") from None
+        raise InputError(f"{folder}: exists, the demo needs a new folder") from None
     except OSError as error:
-        raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
+        raise InputError(f"{folder}: cannot be created: {error.strerror}") from None
     return folder
 
 
@@ -416,10 +416,10 @@ def _print(console: "Console", crossing: CrossingResult, drive: SimulatedDrive, 
 def _say_where(console: "Console", folder: Path, seconds: float) -> None:
     lines = [
         f"\n{folder}/ ({seconds:.0f} s)",
-        f"  {_RECORDING:<16} what the logger recorded; driveby identify {folder / _RECORDING}",
-        f"  {_RESULTS:<16} what the worker found; {_TEXT} is the same as text",
-        f"  {_VIEWS:<16} everything in pictures; driveby view {folder / _VIEWS}",
-        f"  {_FIGURE:<16} flexural rigidity and road profiles at a glance",
+        f"  {_RECORDING:<16} recording by the logger; driveby identify {folder / _RECORDING}",
+        f"  {_RESULTS:<16} results of the worker; {_TEXT} has them as text",
+        f"  {_VIEWS:<16} all signals and results for the viewer; driveby view {folder / _VIEWS}",
+        f"  {_FIGURE:<16} figure of flexural rigidity and road profiles",
     ]
     for line in lines:
         console.print(line, highlight=False, soft_wrap=True)

@@ -61,7 +61,7 @@ def _loaded(paths: Sequence[Path], progress: Steps) -> Iterator[Results]:
         if path.suffix == ".mcap":
             raise InputError(
                 f"{path}: is a recording, results are expected: "
-                f"driveby identify {path} --json RESULTS.json makes them"
+                f"driveby identify {path} --json RESULTS.json computes them"
             )
     for number, path in enumerate(paths):
         progress(sum(sizes[:number]), sum(sizes))

@@ -61,7 +61,7 @@ def archive_command(
     for name, path in single.items():
         if path is not None:
             raise InputError(
-                f"--{name}: is for recordings one looks at; identify these without --into"
+                f"--{name}: cannot be combined with --into; identify single recordings without it"
             )
     check_certificates(certificates)
     if json_path is not None:
@@ -162,25 +162,25 @@ def _write(
 def _print_summary(
     found: ArchiveResult, problems: Sequence[str], site: Site, into: Path, console: "Console"
 ) -> int:
-    def say(line: str) -> None:
+    def write(line: str) -> None:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     for number, (name, state) in enumerate(found.bridges.items()):
         if number == _MAX_BRIDGES:
-            say(f"… and {count_of(len(found.bridges) - number, 'more bridge')}")
+            write(f"… and {count_of(len(found.bridges) - number, 'more bridge')}")
             break
         print_bridge(console, site.bridge(name), state)
         console.print()
     for problem in problems:
-        say(problem)
+        write(problem)
     for crossing_id in found.failed:
-        say(f"{crossing_id}: its identification failed, see the log; it is tried again next time")
+        write(f"{crossing_id}: identification failed, see the log; the next run tries it again")
     verdicts = ", ".join(
         f"{number} {verdict}" for verdict, number in sorted(found.verdicts.items())
     )
     number = found.verdicts.total()
-    say(
-        f"{number} crossing{'s' if number != 1 else ''}, {found.there} known from before"
+    write(
+        f"{number} crossing{'s' if number != 1 else ''}, {found.there} from earlier runs"
         f"{verdicts and f': {verdicts}'}; results in {into}, bridges in {into / BRIDGES}"
     )
     return EXIT_SOMETHING_LOST if problems or found.failed else 0

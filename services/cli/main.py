@@ -113,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.debug:
             traceback.print_exc()
         if isinstance(error, UnicodeEncodeError) and error.reason == "surrogates not allowed":
-            return fail(f"{error.object[:200]}: is no name in UTF-8; rename it", EXIT_BAD_INPUT)
+            return fail(f"{error.object[:200]}: is not a name in UTF-8; rename it", EXIT_BAD_INPUT)
         if isinstance(error, OSError) and error.filename is not None:
             code = EXIT_BAD_INPUT if error.errno in _BAD_NAMES else EXIT_FAILED
             return fail(str(name_error(Path(os.fsdecode(error.filename)), error)), code)
@@ -128,7 +128,7 @@ def _check_names(files: Files) -> None:
     try:
         Path.cwd()
     except OSError as error:
-        raise InputError("the working directory is gone, change to one that exists") from error
+        raise InputError("the working directory no longer exists, change to another one") from error
     for path in (*files.outputs, *files.folders):
         if not is_unicode(str(path)):  # libraries that write cannot use such a name
             raise InputError(f"{path}: the name is not UTF-8; give another name to write")

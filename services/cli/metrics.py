@@ -168,7 +168,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         if self.path.partition("?")[0] != "/metrics":
-            self.send_error(404, "only /metrics is here")
+            self.send_error(404, "only /metrics is served")
             return
         body = exposition(self.server.board.services(time.time())).encode()
         self.send_response(200)

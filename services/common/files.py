@@ -82,7 +82,7 @@ def check_writable(path: Path, *, force: bool = False, kinds: tuple[Kind, ...] =
             raise InputError(f"{path}: is a folder, give the name of a file to write")
         if path.exists() and not path.is_file():
             # Renaming a file onto a device or a pipe would replace it.
-            raise InputError(f"{path}: is no ordinary file, give the name of a file to write")
+            raise InputError(f"{path}: is not an ordinary file, give the name of a file to write")
         if not path.parent.is_dir():
             raise InputError(f"{path}: the folder {path.parent} does not exist, make it first")
         is_there = path.exists()
@@ -206,7 +206,7 @@ def lock_folder(folder: Path, lock: str, in_use: str) -> int:
         flags = os.O_RDONLY if is_readable_only else os.O_RDWR | os.O_CREAT
         file = os.open(path, flags, 0o644)
     except OSError as error:
-        raise InputError(f"{folder}: cannot be made or written: {_reason(error)}") from None
+        raise InputError(f"{folder}: cannot be created or written: {_reason(error)}") from None
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
@@ -243,7 +243,7 @@ def check_folder_writable(folder: Path) -> None:
         there = there.parent
     if not there.is_dir():
         what = "a file" if there.exists() else "a link to nothing"
-        raise InputError(f"{folder}: cannot be made, {there} is {what}")
+        raise InputError(f"{folder}: cannot be created, {there} is {what}")
     if not os.access(there, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: no permission to write in the folder {there}")
 
@@ -256,7 +256,7 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: cannot be made a folder: {_reason(error)}") from error
+        raise InputError(f"{folder}: cannot be created as a folder: {_reason(error)}") from error
     check_folder_writable(folder)
 
 
@@ -266,7 +266,9 @@ def check_ordinary(path: Path) -> None:
     Opening a pipe without a writer would block for ever.
     """
     if path.exists() and not path.is_file() and not path.is_dir():
-        raise InputError(f"{path}: is no ordinary file (a pipe or a device), give one that is")
+        raise InputError(
+            f"{path}: is not an ordinary file but a pipe or a device; give an ordinary one"
+        )
 
 
 def read_text(path: Path) -> str:

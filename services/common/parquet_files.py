@@ -98,7 +98,7 @@ def decoded(
         return found
     except (pa.ArrowException, OSError) as error:
         why = " ".join(str(error).split()).split(". ")[0][:100]
-        raise ValueError(f"is no file of {key} ({why})") from None
+        raise ValueError(f"is not a file of {key} ({why})") from None
 
 
 def _check_size(metadata: Any, most: ReadLimits) -> None:

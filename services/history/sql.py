@@ -55,7 +55,7 @@ def query(folder: Path, question: str) -> QueryResult:
     Raise InputError if there is no history, or DuckDB rejects the query.
     """
     if not bridges_of(folder):
-        raise InputError(f"{folder}: is no history; driveby history add RESULTS creates one")
+        raise InputError(f"{folder}: is not a history; driveby history add RESULTS creates one")
     files = f"{folder / CROSSINGS}/{_PARTITIONS}/{FILES}"
     try:
         return _run_query(question, files, ())

@@ -47,7 +47,7 @@ def _rows(path: Path) -> dict[str, list[tuple[float, float]]]:
             raise InputError(f"{path}: line {number}: two numbers are expected") from None
         if not (isfinite(time_s) and _LOWEST <= value <= _HIGHEST):
             raise InputError(
-                f"{path}: line {number}: {value:g} is no temperature of a bridge in °C "
+                f"{path}: line {number}: {value:g} is not a temperature of a bridge in °C "
                 f"({_LOWEST:g} to {_HIGHEST:g})"
             )
         found[row.get("bridge") or ""].append((time_s, value))

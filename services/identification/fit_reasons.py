@@ -94,7 +94,7 @@ def _place_of_misfit(off_bridge_chi2: float) -> str:
     if off_bridge_chi2 <= EXPLAINED_CHI2:
         return (
             "only on the bridge; likely causes are another vehicle on it, an undeclared support, a "
-            "wrong span, or a bridge that is no beam"
+            "wrong span, or a bridge that is not a beam"
         )
     return (
         f"also before and after the bridge (χ² {off_bridge_chi2:.2g}); likely causes are another "

@@ -98,11 +98,13 @@ def _check(path: Path, results: Results, site: Site) -> None:
         names = {f"EI_{n}" for n in range(1, elements + 1)}
         if crossing.parameters is not None and not names <= crossing.parameters.keys():
             raise InputError(
-                f"{path}: {crossing.crossing_id[:80]} has not the {elements} elements that the "
+                f"{path}: {crossing.crossing_id[:80]} does not have the {elements} elements that the "
                 f"site file gives {crossing.bridge}"
             )
         if not 0.0 <= crossing.entry_time < _LATEST_S:
-            raise InputError(f"{path}: entry_time {crossing.entry_time:g} s is no time since 1970")
+            raise InputError(
+                f"{path}: entry_time {crossing.entry_time:g} s is not a time in s since 1970"
+            )
 
 
 def _report(

@@ -93,7 +93,9 @@ class _Authority(NamedTuple):
         try:
             key = load_pem_private_key(read_bytes(path), password=None)
         except (ValueError, TypeError):
-            raise InputError(f"{path}: is no private key in PEM form without a password") from None
+            raise InputError(
+                f"{path}: is not a private key in PEM format without a password"
+            ) from None
         if not isinstance(key, _Key) or key.public_key() != self.certificate.public_key():
             raise InputError(f"{path}: is not the key of {AUTHORITY} next to it")
         return key

@@ -234,7 +234,10 @@ def describe_crossing(crossing: CrossingView, found: Comparison | None) -> list[
         return []
     if crossing.resolution is None:
         return sentences(found)
-    return [*describe_clear_elements(found), f"Not all is resolved: {crossing.resolution}."]
+    return [
+        *describe_clear_elements(found),
+        f"Not all elements are resolved: {crossing.resolution}.",
+    ]
 
 
 def view_of_crossing(crossing: CrossingResult, bridge: ElementGeometry) -> CrossingView:

@@ -46,7 +46,7 @@ class ViewSettings:
         metavar="ADDRESS",
     )
     port: int = opt(
-        "port of the server (default: any that is free)",
+        "port of the server (default: any free port)",
         whole("a port", 0, 65_535),
         default=0,
         group=_LIVE,

@@ -62,7 +62,7 @@ def view_command(*, target: str | Path, web: bool, console: Console) -> int:
     if not path.is_file():
         raise InputError(f"{path}: no such file, one of {', '.join(SUFFIXES)} is expected")
     if path.suffix not in SUFFIXES:
-        raise InputError(f"{path}: is none of {', '.join(SUFFIXES)}")
+        raise InputError(f"{path}: is not one of {', '.join(SUFFIXES)}")
     prepare_viewer(window=not web)
     with tempfile.TemporaryDirectory(prefix="driveby-view-") as folder:
         shown = path

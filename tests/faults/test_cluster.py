@@ -265,7 +265,7 @@ def test_a_client_that_is_killed_goes_on(
     second = begin(*of(recordings, *on(two, into, "--json", str(path))))
     held.file.unlink()
     assert second.wait() == 0, second.said()
-    assert f"{CROSSINGS} crossings, {there} known from before" in second.said()
+    assert f"{CROSSINGS} crossings, {there} from earlier runs" in second.said()
     assert results_of(path) == of_one_process
     assert len(contents(into)) == len(set(contents(into))) == CROSSINGS
 

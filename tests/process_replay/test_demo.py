@@ -182,7 +182,7 @@ def test_a_folder_that_exists_is_left_alone(
     (tmp_path / "kept").write_text("kept")
     done = run(capsys, "demo", "--out", tmp_path)
     assert done.code == 2
-    assert done.err == f"driveby: {tmp_path}: exists, the demo wants a new folder\n"
+    assert done.err == f"driveby: {tmp_path}: exists, the demo needs a new folder\n"
     assert [path.name for path in tmp_path.iterdir()] == ["kept"]
 
 

@@ -204,7 +204,7 @@ def test_a_crossing_is_identified_under_access_control(
             ["logger", "--listen", "tcp/0.0.0.0:7447"],
             (
                 "tcp/0.0.0.0:7447 can be reached by other machines, and without --tls FOLDER "
-                "anybody there could publish as a truck; say --insecure if that is wanted "
+                "anybody there could publish as a truck; add --insecure if that is intended "
                 "(see docs/security.md)"
             ),
         ),

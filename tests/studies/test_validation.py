@@ -189,8 +189,8 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert "does not exist" in refused(capsys, "--json", str(tmp_path / "no" / "out.json"))
     file = tmp_path / "file"
     file.touch()
-    assert "cannot be made a folder" in refused(capsys, "--figures", str(file))
-    assert "cannot be made a folder" in refused(capsys, "--figures", str(file / "below"))
+    assert "cannot be created as a folder" in refused(capsys, "--figures", str(file))
+    assert "cannot be created as a folder" in refused(capsys, "--figures", str(file / "below"))
     for method, picture in (("paper", "scenarios.png"), ("pre", "calibration.png")):
         (tmp_path / method / picture).mkdir(parents=True)
         figures = ("--figures", str(tmp_path / method), "--worlds", "0")

@@ -85,7 +85,7 @@ class AlarmOptions:
 def _alarm(options: AlarmOptions) -> int:
     what, bridge = options.what, options.bridge
     if (bridge is None) == (what == "ack"):
-        raise InputError("alarm: ack wants the name of a bridge, and nothing else does")
+        raise InputError("alarm: ack needs the name of a bridge; check, list and serve take none")
     if bridge is not None:
         return _acknowledge(options, bridge)
     if what == "list":

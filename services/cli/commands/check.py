@@ -106,7 +106,7 @@ def _raise_on_faults(path: Path, *, wants_json: bool) -> None:
         _print_json([report])
     else:
         print("\n".join(lines_of(report, is_brief=False)))
-    raise InputError(f"{path}: {len(faults)} things are wrong; nothing else was checked")
+    raise InputError(f"{path}: {len(faults)} values are wrong; nothing else was checked")
 
 
 def _print_json(reports: "list[CheckReport]") -> None:

@@ -49,7 +49,9 @@ def _roles(folder: Path) -> "ClusterCredentials":
     from services.cluster.run import ClusterCredentials
 
     if not folder.is_dir():
-        raise InputError(f"--tls: {folder} is no folder; driveby certs {folder} --cluster makes it")
+        raise InputError(
+            f"--tls: {folder} is not a folder; driveby certs {folder} --cluster creates it"
+        )
     names = ("scheduler", "cluster-worker", "client")
     return ClusterCredentials(*(credentials_of(folder / name, name) for name in names))
 

@@ -73,7 +73,7 @@ def _export(options: ExportOptions) -> int:
             path = write_table(folder, table, form)
             print(f"{path}: {count_of(len(next(iter(table.columns.values()))), 'row')}")
     if found.site is None:
-        print("no site file: places of bridges are not known, so there is no GeoJSON")
+        print("no site file: positions of bridges are unknown, so no GeoJSON is written")
         return 0
     texts = _maps(found, found.site, with_sensorthings=options.sensorthings)
     if has_runs_as_csv:
@@ -94,7 +94,7 @@ def _read(options: ExportOptions) -> _Found:
     results, results_path = _results(options.sources)
     site = _site(options.site, recordings, results, results_path)
     if options.sensorthings and (results is None or site is None):
-        raise InputError("--sensorthings: wants a results file, and the site file of its bridges")
+        raise InputError("--sensorthings: needs a results file, and the site file of its bridges")
     with reading_bar("reading", recordings) as next_file:
         runs = [run for path in recordings for run in signals_of_recording(path, next_file())]
     passings = []

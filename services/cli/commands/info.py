@@ -199,7 +199,7 @@ def _gaps_in_words(gaps: "SampleGaps") -> str:
     if not gaps.number:
         return "no gaps in the samples"
     return (
-        f"{count_of(gaps.number, 'gap')} in the samples, {gaps.total_s:.3g} s together, the "
+        f"{count_of(gaps.number, 'gap')} in the samples, {gaps.total_s:.3g} s in all, the "
         f"longest {gaps.longest_s:.3g} s; one on a bridge rejects the crossing (gap_on_bridge)"
     )
 

@@ -194,7 +194,7 @@ def _refuse(asked: ValidateOptions, others: frozenset[str], what: str) -> None:
     for field in fields(asked):
         if field.name in others and getattr(asked, field.name) != field.default:
             raise InputError(
-                f"{option_of(field.name)}: {what}, it has nothing to do with what is asked for"
+                f"{option_of(field.name)}: {what}; it has no effect here, leave it out"
             )
 
 

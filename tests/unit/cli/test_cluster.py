@@ -50,7 +50,7 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, s
         ),
         (["--scheduler", "tcp://127.0.0.1:1", "--batch", "201"], "from 1 to 200"),
         (["--into", "s3://bucket/new"], "a folder of this machine is expected"),
-        (["--into", "new", "--rrd", "x.rrd"], "--rrd: is for recordings one looks at"),
+        (["--into", "new", "--rrd", "x.rrd"], "--rrd: cannot be combined with --into"),
         (["--scheduler", "processes", "--draws", "x.npz"], "--draws"),
     ],
 )
@@ -148,13 +148,13 @@ def test_a_folder_is_identified_by_its_catalogue_and_gone_on_with(
         (folder / CATALOG / "bad.parquet", "left out"),
     ):
         assert sum(f"{path}: " in one and line in one for one in out.splitlines()) == 1, out
-    assert "1 crossing, 0 known from before: 1 suspect" in out
+    assert "1 crossing, 0 from earlier runs: 1 suspect" in out
     assert (into / BRIDGES).is_file()
     (folder / "none.mcap").unlink()
     (folder / CATALOG / "bad.parquet").unlink()
     drives(tmp_path / "later", 2)[1].rename(folder / "later.mcap")
     assert cli.main(["identify", str(folder), *QUICK, "--into", str(into)]) == 0
-    assert "2 crossings, 1 known from before: 2 suspect" in capsys.readouterr().out
+    assert "2 crossings, 1 from earlier runs: 2 suspect" in capsys.readouterr().out
 
 
 def test_unwritable_output_is_refused_at_the_beginning(
@@ -205,7 +205,7 @@ def test_recordings_in_an_object_store_give_what_they_give_here(
         capsys.readouterr()
         assert cli.main([str(a) for a in there]) == EXIT_SOMETHING_LOST  # bad.mcap
         out = capsys.readouterr().out
-        assert "3 crossings, 3 known from before" in out
+        assert "3 crossings, 3 from earlier runs" in out
         assert sum(line.startswith(f"{bad}: ") for line in out.splitlines()) == 1
     assert list(temporary.iterdir()) == []
     whole, alone, from_there, one_from_there = map(results_of, found)

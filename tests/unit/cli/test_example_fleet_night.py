@@ -43,4 +43,4 @@ def test_nights_after_a_loss_of_stiffness_raise_an_alarm(project: Path, tmp_path
         text=True,
     )
     assert again.returncode == 0, again.stderr
-    assert "12 crossings, 12 known from before" in again.stdout
+    assert "12 crossings, 12 from earlier runs" in again.stdout

@@ -38,7 +38,7 @@ def test_a_recording_is_refused_with_what_is_wanted(
     recording = project / "recordings/sample/crossing.mcap"
     assert main(["fuse", str(recording)]) == 2
     error = capsys.readouterr().err
-    assert f"driveby identify {recording} --json RESULTS.json makes them" in error
+    assert f"driveby identify {recording} --json RESULTS.json computes them" in error
     assert error.count("\n") == 1
 
 

@@ -125,7 +125,7 @@ def test_a_link_to_nothing_is_no_folder(
     link.symlink_to(tmp_path / "nothing")
     for folder in (link, link / "below"):
         err = refused(capsys, ["identify", str(SAMPLE), option, str(folder)])
-        assert "cannot be made" in err
+        assert "cannot be created" in err
     assert not (tmp_path / "nothing").exists()
 
 
@@ -139,7 +139,7 @@ def test_a_working_directory_that_is_gone_is_named(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert done.stderr == "driveby: the working directory is gone, change to one that exists\n"
+    assert done.stderr == "driveby: the working directory no longer exists, change to another one\n"
 
 
 def test_help_has_no_two_groups_of_one_title() -> None:

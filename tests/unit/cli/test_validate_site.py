@@ -97,7 +97,7 @@ def test_one_pair_may_be_asked_for(
         (("--scenarios", "1"), "--scenarios: only with --method"),
         (("--noise", "25"), "--noise: only with --method"),
         (("--method", "pre", "--truck", "truck-1"), "--truck: only with --site, no --method"),
-        (("--validations", "{site}"), "{site}: cannot be made a folder"),
+        (("--validations", "{site}"), "{site}: cannot be created as a folder"),
     ],
 )
 def test_bad_input_is_one_line(

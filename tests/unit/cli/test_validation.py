@@ -60,7 +60,7 @@ def test_certificates_refuse_an_option_of_the_studies(
     site = ["--site", str(tmp_path / "site.toml")]
     assert cli.main(["validate", *site, option, VALUES.get(option, "7")]) == 2
     assert capsys.readouterr().err == (
-        f"driveby: {option}: only with --method, it has nothing to do with what is asked for\n"
+        f"driveby: {option}: only with --method; it has no effect here, leave it out\n"
     )
 
 

@@ -87,7 +87,7 @@ def test_a_folder_is_made_with_those_above_it_and_kept(tmp_path: Path) -> None:
     make_folder(folder)
     assert (folder / "kept").exists()
     for place in (folder / "kept", folder / "kept" / "below"):
-        with pytest.raises(InputError, match="cannot be made a folder"):
+        with pytest.raises(InputError, match="cannot be created as a folder"):
             make_folder(place)
 
 

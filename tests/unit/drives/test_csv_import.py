@@ -315,5 +315,5 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     """Nobody writes to it: reading would never end."""
     (tmp_path / "accel_00.csv").write_text(ACCEL)
     os.mkfifo(tmp_path / "gps_00.csv")
-    with pytest.raises(InputError, match=r"gps_00\.csv: is no ordinary file"):
+    with pytest.raises(InputError, match=r"gps_00\.csv: is not an ordinary file"):
         read_folder(tmp_path)

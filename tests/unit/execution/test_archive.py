@@ -235,7 +235,7 @@ def test_a_pipe_is_a_line(five: list[Path], tmp_path: Path) -> None:
     found, crossings = done(tmp_path / "into", pipe, five[0])
     assert len(crossings) == 2
     assert found.problems == (
-        f"{pipe}: is no ordinary file (a pipe or a device), give one that is",
+        f"{pipe}: is not an ordinary file but a pipe or a device; give an ordinary one",
     )
 
 

@@ -107,7 +107,7 @@ def test_parquet_holds_all_runs_with_exact_times(
     write_recording(path, both, site_toml=None, reason="test")
     code, out, _ = run(capsys, "export", path, "--to", tmp_path / "t", "--format", "parquet")
     assert code == 0
-    assert "no site file: places of bridges are not known, so there is no GeoJSON" in out
+    assert "no site file: positions of bridges are unknown, so no GeoJSON is written" in out
     table = pq.read_table(tmp_path / "t" / "accelerations.parquet").to_pandas()
     assert len(table) == (170 + 200) * 50
     assert set(table["vehicle"]) == {"truck-1", "truck-2"}

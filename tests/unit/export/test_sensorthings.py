@@ -105,4 +105,4 @@ def test_the_command_writes_them_or_says_what_it_wants(
     assert len(json.loads((tmp_path / "t/sensorthings.json").read_text())["Things"]) == 1
     capsys.readouterr()
     assert cli.main(["export", str(results), *to]) == 2
-    assert "--sensorthings: wants a results file, and the site file" in capsys.readouterr().err
+    assert "--sensorthings: needs a results file, and the site file" in capsys.readouterr().err

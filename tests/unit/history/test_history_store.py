@@ -220,7 +220,7 @@ def test_temperatures_beside_crossings(tmp_path: Path) -> None:
     path.write_text(f"time_s,temperature_deg_c,bridge\n{rows}")
     assert temperatures_of(path, some.crossings) == {some.crossings[0].crossing_id: 12.0}
     path.write_text("time_s,temperature_deg_c\n1,2\n5,900\n")
-    with pytest.raises(InputError, match=r"t\.csv: line 3: 900 is no temperature"):
+    with pytest.raises(InputError, match=r"t\.csv: line 3: 900 is not a temperature"):
         temperatures_of(path, some.crossings)
     path.write_text("time,temp\n1,2\n")
     with pytest.raises(InputError, match=r"t\.csv: has no column time_s, but time, temp"):
@@ -289,7 +289,7 @@ def test_a_history_that_is_none(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         overview(tmp_path / "nowhere")
     shutil.rmtree(tmp_path / "history", ignore_errors=True)
-    with pytest.raises(InputError, match="is no history"):
+    with pytest.raises(InputError, match="is not a history"):
         overview(tmp_path)
 
 

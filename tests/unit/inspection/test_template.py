@@ -147,7 +147,7 @@ def test_the_command_writes_it_and_spoils_nothing(
     assert lines[0].startswith(
         "  wrong  vehicle.total_mass_kg is NaN (not filled in), it must be a mass"
     )
-    assert said.err.endswith(f"{new}: {len(lines)} things are wrong; nothing else was checked\n")
+    assert said.err.endswith(f"{new}: {len(lines)} values are wrong; nothing else was checked\n")
     assert said.err.count("\n") == 1
     assert len(lines) == len(NEEDED.findall(TEMPLATE))
     assert cli.main(["check", str(new), "--json"]) == 2

@@ -126,7 +126,7 @@ def test_a_pipe_is_refused_and_not_waited_for(
 ) -> None:
     pipe = tmp_path / "rec.mcap"
     os.mkfifo(pipe)
-    with pytest.raises(InputError, match="is no ordinary file"):
+    with pytest.raises(InputError, match="is not an ordinary file"):
         command(pipe)
 
 

@@ -449,8 +449,11 @@ def test_what_cannot_be_reported_is_one_line_and_leaves_nothing(
         ((found, *with_site, "-o", tmp_path / "r.txt"), "an HTML file (.html) is expected"),
         ((found, *with_site, "-o", tmp_path / "no" / "r.html"), "does not exist"),
         ((found, *with_site, "--baseline", changed("b", {}).with_name("x.json")), "no such file"),
-        ((changed("c", {"parameters": parameters}), *with_site), "has not the 7 elements that"),
-        ((changed("d", {"entry_time": 1e300}), *with_site), "is no time since 1970"),
+        (
+            (changed("c", {"parameters": parameters}), *with_site),
+            "does not have the 7 elements that",
+        ),
+        ((changed("d", {"entry_time": 1e300}), *with_site), "is not a time in s since 1970"),
         ((changed("e", {"bridge": "b-9"}), *with_site), "has results of b-9, which"),
     ):
         out = () if "-o" in arguments else ("-o", tmp_path / "r.html")

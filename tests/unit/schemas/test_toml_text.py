@@ -158,7 +158,7 @@ def test_a_file_that_is_too_large_or_none_is_not_read(tmp_path: Path) -> None:
         load_site(path)
     pipe = tmp_path / "pipe.toml"
     os.mkfifo(pipe)
-    with pytest.raises(InputError, match="is no ordinary file"):
+    with pytest.raises(InputError, match="is not an ordinary file"):
         load_site(pipe)
 
 

@@ -260,9 +260,9 @@ def test_bad_credentials_are_named_before_anybody_connects(folder: Path, tmp_pat
     (truck / KEY).write_bytes((folder / "viewer" / KEY).read_bytes())
     refused(f"{KEY}: is not the key of {CERTIFICATE}")
     (truck / KEY).write_text("nonsense")
-    refused("is no private key in PEM form")
+    refused("is not a private key in PEM format")
     (truck / CERTIFICATE).write_text("nonsense")
-    refused("is no certificate in PEM form")
+    refused("is not a certificate in PEM format")
     (truck / CERTIFICATE).unlink()
     refused("no such file")
     (truck / AUTHORITY).write_bytes((other / "truck-1" / AUTHORITY).read_bytes())
@@ -300,7 +300,7 @@ def test_a_service_uses_its_own_credentials(folder: Path) -> None:
     ["tcp/0.0.0.0:0", "tcp/[::]:0", "tcp/192.0.2.1:7447", "tcp/somewhere:7447", "ws/0.0.0.0:0"],
 )
 def test_listening_beyond_loopback_needs_insecure(listen: str) -> None:
-    with pytest.raises(InputError, match=r"say --insecure if that is wanted"):
+    with pytest.raises(InputError, match=r"add --insecure if that is intended"):
         open_session(listen=listen)
 
 

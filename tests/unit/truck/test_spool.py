@@ -280,7 +280,7 @@ def test_bad_folders_and_budgets_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at least 1 MiB"):
         Spool(tmp_path, budget_bytes=1000)
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be made"):
+    with pytest.raises(InputError, match="cannot be created"):
         Spool(tmp_path / "file" / "spool")
 
 

@@ -372,7 +372,7 @@ def test_what_cannot_be_read_is_left_out(live: Live) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--listen", "localhost"], "--listen localhost: is no IPv4 address"),
+        (["--listen", "localhost"], "--listen localhost: is not an IPv4 address"),
         (["--realm", "monday"], "realm 'monday' must be live"),
         (["--site", "missing.toml"], "missing.toml"),
         (["--endpoint", "nowhere"], "endpoint 'nowhere'"),
