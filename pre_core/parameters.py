@@ -1,4 +1,4 @@
-"""The table of parameters that are estimated of a truck and a bridge, one row each.
+"""Table of the estimated parameters of truck and bridge, one row each.
 
 A parameter vector theta has the rows of the truck first, then those of the bridge, then EI of every
 element. To add a parameter, add a row here and its effect in `physics` (and the sensor noise that

@@ -1,6 +1,6 @@
 """Comparison of two optima of one crossing.
 
-Chi2 shows whether a fit explains the residuals by its own noise, and not which of two fits is
+Chi2 shows whether a fit explains the residuals by its own noise, but not which of two fits is
 likelier: levels of mismatch and suspension noise follow from the residuals, so that a wrong bridge
 with more noise has a chi2 of one, too. Two accepted fits are therefore compared by their posterior
 densities, which contain the normalisation of the noise.

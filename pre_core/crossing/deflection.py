@@ -1,6 +1,6 @@
 """The deflection of the bridge under the wheels of one crossing, at given parameters.
 
-The wheels' loads march the bridge's modes from sample to sample; what deflects at once is added.
+The wheels' loads drive the bridge's modes from sample to sample; the quasi-static part is added.
 """
 
 import numpy as np
@@ -197,7 +197,7 @@ def add_deflection(
 
 @kernel
 def _advance(work: Buffers, begin: int, stop: int) -> None:
-    """March all modes over the samples of a stretch in which each wheel stays in one part."""
+    """Advance all modes over the samples of a stretch in which each wheel stays in one part."""
     if work.part.shape[0] == 3:
         tandem.advance(work, begin, stop)
         return

@@ -1,6 +1,6 @@
 """Noise from the front axle of a truck with a tandem, whose own profile is not measured.
 
-The inertia force m_u z'' of that axle follows from the profile that the tandem found at the same
+The inertia force m_u z'' of that axle follows from the profile that the tandem measured at the same
 place (`tandem.lead_motion`). Its tyres are on other strips, though: the difference e(x) of the
 profiles is unknown, and its inertia force deflects the bridge under all axles. With the spectrum
 S_e of e, the axle's acceleration has an error of the spectrum (2 pi f)^4 |H|² S_e(f/v)/v, H its
@@ -14,10 +14,10 @@ Residuals w that are white but for this noise are whitened by
 
 because cov(w) = I + B B'. The response to the force at each knot is computed once and serves this
 and the roughness of the deck (`pavement.estimate_pavement`): the bridge's response has waves as
-short as that roughness, and would be taken for it. In the few bands in which the bridge responds,
-the noise is many times that of the sensors; it would be taken for damping or for support springs.
-All runs over one lane have the same e, so that it does not average out: in a fusion its power
-counts `RUNS` times.
+short as that roughness, and would be mistaken for it. In the few bands in which the bridge
+responds, the noise is many times that of the sensors; it would be mistaken for damping or for
+support springs. All runs over one lane have the same e, so that it does not average out: in a
+fusion its power counts `RUNS` times.
 """
 
 from typing import Final, NamedTuple
@@ -109,7 +109,7 @@ def without_front_axle(
 ) -> Whitener:
     """Return the whitener with the front axle's noise, `runs` times its power.
 
-    `noise` is that of the other sources. It is returned as it is without a `response`.
+    `noise` is that of the other sources. Without a `response` it is returned unchanged.
     """
     noise = noise._replace(low_rank=np.zeros((0, 0)))
     if response is None:

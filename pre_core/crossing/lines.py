@@ -33,8 +33,8 @@ _WITHIN_HZ, _BESIDE_HZ = 0.4, 2.5
 _WITHIN_BINS = 2.5
 """Half width of a line in a short record, by Hann's window."""
 _MIN_PROMINENCE = 30.0
-"""Smallest peak of a line in the periodogram over the mean beside it. For noise alone the highest
-of a record is 10 times that; wheel hop has peaks 1 Hz wide and more."""
+"""Smallest peak of a line in the periodogram over the mean of the adjacent frequencies. For noise
+alone the highest of a record is 10 times that; wheel hop has peaks 1 Hz wide and more."""
 _FEWEST = 40
 """Fewest frequencies for a detection."""
 _PARTS = 4
@@ -45,7 +45,7 @@ _PEAKS = 4
 
 
 class _Spectra(NamedTuple):
-    """Periodogram (f, kinds) of residuals at frequencies (f,), each over the median beside it."""
+    """Periodogram (f, kinds) of residuals at frequencies (f,), each over the median nearby."""
 
     hz: FloatArray
     power: FloatArray
@@ -67,7 +67,7 @@ def line_waves(lines_hz: Sequence[float], count: int, apart_s: float) -> FloatAr
 
 
 def project_out(columns: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return residuals (k, m) less their part in the span of orthonormal columns (m, w)."""
+    """Return residuals (k, m) minus their part in the span of orthonormal columns (m, w)."""
     return np.asarray(rows - (rows @ columns) @ columns.T)
 
 
@@ -105,7 +105,7 @@ def _is_narrow(hz: FloatArray, power: FloatArray, line_hz: float) -> bool:
 
 
 def _prominence(hz: FloatArray, power: FloatArray, line_hz: float) -> FloatArray:
-    """Return the peak at a line over the mean beside it, of each periodogram (k, f)."""
+    """Return the peak at a line over the mean nearby, of each periodogram (k, f)."""
     apart = np.abs(hz - line_hz)
     within = max(_WITHIN_HZ, _WITHIN_BINS * float(hz[1] - hz[0]))
     beside = power[:, (apart > within) & (apart < within + _BESIDE_HZ)].mean(axis=1)

@@ -1,6 +1,6 @@
 """Profile mismatch of the two axles as noise whose level the run itself determines.
 
-The profile of the front axle at a place less that of the rear axle there, d(x), is a stationary
+The profile of the front axle at a place minus that of the rear axle there, d(x), is a stationary
 random process along the road with the one-sided spectrum
 
     S_d(n) = sum over j of A_j T_j(n),   A_j >= 0.
@@ -60,7 +60,7 @@ class MismatchSpectra(NamedTuple):
     """The spectrum of d, windowed."""
     front_cross_spectrum_density: FloatArray
     """Cross spectrum (s, g) of the front axle's profile with d. That of the rear axle is this one
-    less the spectrum of d."""
+    minus the spectrum of d."""
     footprints: tuple[Footprint, Footprint]
     road: FloatArray
     """Windowed profile spectrum (g,) of the front axle on a surface of Phi k^3 = 1 m²."""

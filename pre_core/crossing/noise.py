@@ -7,7 +7,7 @@ acceleration noise of densities n_s, n_u enters them as
     s^2 R_i   : [1 + (m_u s^2 + c_s s + k_s)/K] n_u - [(c_s s + k_s)/K] n_s,  K = k_u + c_u s
     s^2 b_i   : [(m_ii s^2 + c_s s)/k_s + 1] n_s - [c_s s/k_s + 1] n_u + [m_12 s^2/k_s] n_s'
 
-(front less rear in the mismatch; n_s' is the noise of the other body sensor). The front axle's
+(front minus rear in the mismatch; n_s' is the noise of the other body sensor). The front axle's
 residuals are taken when its wheel was at the rear wheel's present place, so that a sensor in both
 counts as two.
 
@@ -268,7 +268,7 @@ def noise_power(
     which: list[int],
     road: Mismatch | None = None,
 ) -> FloatArray:
-    """Return tr(C_0^-1 C) per residual sample for other trucks, less that of the first: (w,).
+    """Return tr(C_0^-1 C) per residual sample for other trucks, minus that of the first: (w,).
 
     `which` (w,) counts from the second truck on; `density` is (trucks, 4), `force` (2, shapes). The
     spectra are those of an endless record of residuals, aliased at half their rate.

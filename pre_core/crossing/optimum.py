@@ -1,7 +1,7 @@
 """Method `pre`: search for the optimum of one crossing's posterior.
 
 The negative log posterior has one deep minimum and many shallow ones: with every element free, a
-bridge placed half a metre too far fits almost as well with other rigidities. So the search
+bridge shifted by half a metre fits almost as well with other rigidities. So the search
 
     1. finds truck and trajectory while the bridge may change only as a whole, with a noise far
        above the actual one, reduced step by step;
@@ -84,16 +84,17 @@ _MAX_EVALUATIONS = 100_000
 """Limit of a whole search. The sample takes 2,000, a site file with two supports too many 65,000:
 beyond this a search has failed, and its numbers are not reliable."""
 _MAX_LINES = 3
-"""Hum and its harmonics; a record with more lines is not one of a truck on a road."""
+"""Limit of removed lines: hum and its harmonics. A record with more is not one of a truck on a
+road."""
 _SIMPLEST = SearchStrategy(SWING_MODES, True, 1, False)
 _WITHOUT_MISMATCH = (
     SearchStrategy(SWING_MODES - 1, True, 4, False),
     SearchStrategy(0, False, 4, False),
 )
 _WITH_MISMATCH = (SearchStrategy(SWING_MODES, True, 1, True), SearchStrategy(0, False, 4, True))
-"""The simplest strategy first, then others until one ends at a fit, because each superfluous
-freedom may mislead. Of 40 drawn crossings and 36 with unexpected bearings, spans or tyres the first
-found all but one, which the second did."""
+"""Strategies in the order of trial, the simplest first, until one ends at a fit: each superfluous
+freedom may mislead the search. Of 40 drawn crossings and 36 with unexpected bearings, spans or
+tyres the first found all but one, which the second did."""
 
 
 class _Budget(NamedTuple):
@@ -356,9 +357,9 @@ def _find_truck(
 ) -> tuple[PosteriorProblem, FloatArray, int]:
     """Return the first stage's problem, coordinates and evaluations, the bridge as a whole.
 
-    Alike profiles (tandem, equal tyres) differ less than a wrong truck makes them differ, so
-    that their truck comes before the mismatch. Otherwise it would follow a mismatch of its own
-    making, to tyres that are ever softer.
+    Similar profiles (tandem, equal tyres) differ less than a wrong truck makes them differ, so the
+    truck is fitted before the mismatch. Otherwise the search would follow a spurious mismatch
+    towards ever softer tyres.
     """
     whole = _whole_bridge(problem, strategy)
     is_alike = has_tandem(problem) or has_equal_tyres(*problem.mismatch.shapes.footprints)

@@ -105,7 +105,7 @@ class PosteriorProblem(NamedTuple):
     line_waves: FloatArray = np.zeros((0, 0))
     """(m, w) orthonormal waves of these lines."""
     front_axle: MismatchSpectra | None = None
-    """Spectra of the profile of the axle ahead of a tandem less that of the tandem."""
+    """Spectra of the profile of the axle ahead of a tandem minus that of the tandem."""
     displaced_leads: tuple[Lead, ...] = ()
     """Front axles with one value displaced by the standard deviation of its prior."""
 

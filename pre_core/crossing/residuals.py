@@ -234,7 +234,8 @@ def _evaluate(
 ) -> None:
     """Compute the requested output of points `part` to their rows of `out`; NaN if impossible.
 
-    One kernel for all three: each would hold a copy of the model, and take as long to load.
+    One kernel serves all three: each of three would contain a copy of the model, and take as long
+    to load.
     """
     rows, noise = filters
     for k in range(part[0], part[1]):

@@ -29,8 +29,8 @@ _MIN_EFFECTIVE_SHARE = 1.0 / 3.0
 _BATCH_SHARE = 1.0 / 3.0
 """Size of a batch of weighted draws, relative to the requested ones."""
 _UNWEIGHTED_BATCHES = 2
-"""Number of first batches whose refinement ignores the weights: their draws lie too far from the
-posterior for weights that mean anything."""
+"""Number of first batches whose refinement ignores the weights: their draws are too far from the
+posterior for informative weights."""
 _MAX_BATCHES = 25
 _MAX_RUNS = 14
 """Limit of draws with mismatch, relative to the requested ones."""
@@ -244,8 +244,8 @@ def _convergence(draws: FloatArray, least_ess: float) -> tuple[float, float, Ter
 def _monitored_indices(problem: posterior.PosteriorProblem) -> NDArray[np.int64]:
     """Return the indices in y of the parameters that must converge: rigidities and mass.
 
-    Level and frequencies follow from these. Whatever of truck and supports they depend on has then
-    converged, too; the rest is no reason against a crossing.
+    Overall stiffness and frequencies follow from these. The parameters of truck and supports that
+    they depend on have then converged, too; the others do not affect the verdict.
     """
     kept = np.flatnonzero(problem.priors.estimated)
     mass = np.flatnonzero(kept == RHO_A)

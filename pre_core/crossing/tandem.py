@@ -2,7 +2,7 @@
 
 The two axles of the tandem take the places of the front and the rear axle of `residuals`; the
 truck's front axle, `Lead`, is a third load ahead of them. Its own inertia force m_u z'' is small:
-it follows from the profile that the tandem found at the same place (`lead_motion`), and is
+it follows from the profile that the tandem measured at the same place (`lead_motion`), and is
 corrected as the estimate of truck and bridge improves.
 """
 
@@ -198,7 +198,7 @@ def _value(c: tuple[Lanes, Lanes, Lanes, Lanes], x: float) -> Lanes:
 
 @kernel
 def advance(work: Buffers, begin: int, stop: int) -> None:
-    """March all modes under three wheels, each in one part, over samples `begin` to `stop`.
+    """Advance all modes under three wheels, each in one part, over samples `begin` to `stop`.
 
     As `modal_response.advance` and `advance_with_ends`: `work.state` is updated and the deflections
     under the wheels are added to `work.lanes`.

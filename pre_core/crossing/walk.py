@@ -1,7 +1,7 @@
 """Scan of longitudinal offsets: fit of the bridge at each, everything else to first order.
 
 At every offset the bridge parameters are fitted with all other columns projected out of the
-residuals, which is cheap and leads downhill to the right offset.
+residuals, which is cheap and descends to the right offset.
 """
 
 from collections.abc import Callable

@@ -33,7 +33,7 @@ class Whitener(NamedTuple):
     factor: FloatArray  # (3 m, band + 1): row i holds columns i - band … i
     reciprocal: FloatArray  # (3 m,) of the diagonal
     lines: FloatArray = np.zeros((0, 0))
-    """(3 m, w) orthonormal columns that are taken out of white residuals, see `lines`."""
+    """(3 m, w) orthonormal columns that are removed from white residuals, see `lines`."""
     low_rank: FloatArray = np.zeros((0, 0))
     """(3 m, k) columns C, after which w - C C'w are white, see `front_axle`."""
 

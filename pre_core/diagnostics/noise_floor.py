@@ -1,8 +1,8 @@
 """The noise density of an accelerometer, from a stretch of its samples.
 
-At standstill nearly all that a sensor shows is its noise; lines of an engine are few, and the
-median over frequencies ignores them. While driving, only frequencies above the wheels' motion are
-noise, which needs at least 400 Hz.
+At standstill a sensor's output is nearly all noise; lines of an engine are few, and the median over
+frequencies ignores them. While driving, only frequencies above the wheels' motion are noise, which
+needs at least 400 Hz.
 """
 
 from typing import Final, NamedTuple

@@ -309,7 +309,7 @@ def _add_adjacent_prior(
     inner: NDArray[np.int64],
     first: int,
 ) -> None:
-    """Add the prior of the coefficients beside the bridge given those on it; in place.
+    """Add the prior of the coefficients next to the bridge given those on it; in place.
 
     They begin at `first`. The prior of those on the bridge is added in fusion.
     """

@@ -30,7 +30,7 @@ from pre_core.physics.surface import Footprint
 FloatArray = NDArray[np.float64]
 
 _NOTHING = 1e-9
-"""Relative variance of a sum of waves that is rounding."""
+"""Relative variance below which a sum of waves is rounding."""
 
 
 class FusionInput(NamedTuple):
@@ -127,7 +127,7 @@ def _track(key: PathGroupKey, runs: list[FusionInput]) -> PathGroup:
 def _short_roots(
     runs: list[FusionInput], cycles_per_m: FloatArray, density: FloatArray
 ) -> dict[str, FloatArray]:
-    """Return the roots of what short waves of a spectrum (g,) do to runs that have a response."""
+    """Return roots of the covariance by short waves of a spectrum (g,), for runs with a response."""
     have = {run.name: run.likelihood.short_waves for run in runs}
     responses = {name: one for name, one in have.items() if one is not None}
     if len(responses) < 2:

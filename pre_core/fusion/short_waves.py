@@ -7,7 +7,7 @@ cycles/m: runs at other speeds v are affected by other waves.
 
 So each crossing keeps the response of its estimate to waves of the mismatch. Fusion adds to a
 crossing's covariance that of its errors with those of the other runs, so that the sum of all is as
-uncertain as errors in common make it.
+uncertain as the shared errors make it.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,8 @@ FloatArray = NDArray[np.float64]
 BESIDE_M = 7.5
 """Distance before and after the bridge over which the mismatch is correlated with that on it."""
 _MAX_CYCLES_PER_M = 4.0
-"""Up to 40 Hz at 10 m/s; the filter of the residuals passes little more."""
+"""Highest spatial frequency: 40 Hz at 10 m/s, and the filter of the residuals passes little
+more."""
 
 
 class ShortWaveResponse(NamedTuple):

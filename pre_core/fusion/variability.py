@@ -1,6 +1,6 @@
 """Variability of a bridge between crossings, beyond the uncertainty of each.
 
-Every crossing has a bridge of its own: its compliances deviate from the common ones by a relative
+Every crossing has its own bridge: its compliances deviate from the common ones by a relative
 standard deviation tau, of which a share rho is common to all elements. These changes are integrated
 out; tau and rho are evaluated on a grid.
 """
@@ -57,7 +57,7 @@ class _SameLayout(NamedTuple):
 
 
 class VaryingBridge(NamedTuple):
-    """The sum of all crossings, and the data to give each a bridge of its own."""
+    """The sum of all crossings, and the data to give each its own bridge."""
 
     precision: FloatArray
     linear: FloatArray
@@ -147,7 +147,7 @@ def _fine_taus(log: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def is_consistent_with_zero(between: VariabilityPosterior) -> bool:
-    """Return whether zero variability is about as likely as the most likely."""
+    """Return whether zero variability is about as likely as the most likely value."""
     density = between.within.reshape(_TAUS.size, len(_RHOS), _FINER).sum(axis=1)
     density /= np.diff(_edges())[:, None]
     return bool(density[0, 0] > _AS_LIKELY * density.max())

@@ -1,4 +1,4 @@
-"""A bridge's baseline: ln EI at a reference temperature, its usual movements, and shared errors.
+"""A bridge's baseline: ln EI at a reference temperature, its usual changes, and shared errors.
 
 Every period has an observation y of ln EI with own covariance R and loadings K on unit normals z
 that it shares with other periods (trucks, wheel-path groups, the other bridge parameters):
@@ -61,7 +61,7 @@ class Period(NamedTuple):
 
 
 class Scales(NamedTuple):
-    """Grid of the sizes of usual movements, (m,) each."""
+    """Grid of the sizes of usual changes, (m,) each."""
 
     change: FloatArray
     """Values of q."""

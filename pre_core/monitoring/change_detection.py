@@ -41,7 +41,7 @@ FloatArray = NDArray[np.float64]
 
 SMALLEST_CHANGE = 0.05
 SEASON_DAYS = 364.0
-"""Time from the first period after which the season is known without a thermometer."""
+"""Time from the first period after which the season is known without temperatures."""
 PROBABILITY = 0.975
 """Probability with which a change must exceed the smallest one of interest."""
 _UNLIKELY, _WORTHWHILE = 1e-6, 0.75
@@ -207,8 +207,8 @@ def _update_unless_outlier(
 ) -> tuple[BaselineState, FloatArray | None]:
     """Return the state after a judged period, and the Kalman gain (`update_state`).
 
-    An outlier, whose covariance is inflated, leaves the state as it is and has no gain: it would
-    move the baseline, and undamaged periods would pass for a change.
+    An outlier, whose covariance is inflated, leaves the state as it is and has no gain: otherwise
+    it would shift the baseline, and undamaged periods would look like a change.
     """
     return update_state(state, innovation) if inflation == 1.0 else (state, None)
 

@@ -1,8 +1,8 @@
-"""The paper's residual: the road under the front wheel less the road under the rear wheel.
+"""The paper's residual: the road under the front wheel minus the road under the rear wheel.
 
-r_i = u_i - y_i (input less deflection) at each wheel; R_1(x) - R_2(x) vanishes for the right
-parameters, and J = integral of (R_1 - R_2)^2 dx (paper eq. 21). A `PaperWindow` (`window`) holds
-everything that does not depend on the parameters.
+r_i = u_i - y_i (input profile minus deflection) at each wheel; R_1(x) - R_2(x) vanishes for the
+right parameters, and J = integral of (R_1 - R_2)^2 dx (paper eq. 21). A `PaperWindow` (`window`)
+holds everything that does not depend on the parameters.
 """
 
 from typing import NamedTuple

@@ -366,7 +366,7 @@ def _one_mode_one_wheel(
 
 @kernel
 def advance(filters: ModalFilters, wheels: WheelStretch) -> None:
-    """March all modes over a stretch: update `filters.state`, and *add* to the deflections."""
+    """Advance all modes over a stretch: update `filters.state`, and *add* to the deflections."""
     front = filters.cubics[max(wheels.front, 0)]
     rear = filters.cubics[max(wheels.rear, 0)]
     feedback, state, force = filters.feedback, filters.state, wheels.force

@@ -222,7 +222,7 @@ def _no_wheel(feedback: FloatArray, state: FloatArray, steps: int) -> None:
 
 @kernel
 def advance(filters: ModalFilters, wheels: LoadedStretch) -> None:
-    """March all modes over a stretch: update `filters.state`, and *add* to the deflections."""
+    """Advance all modes over a stretch: update `filters.state`, and *add* to the deflections."""
     cubics, feedback, state = filters.cubics, filters.feedback, filters.state
     place, force, deflection = wheels.place, wheels.force, wheels.deflection
     front, rear = wheels.front, wheels.rear
@@ -314,6 +314,6 @@ def _group_with_ends(
 
 @kernel
 def advance_with_ends(filters: ModalFilters, wheels: LoadedStretch, ends: EndStretch) -> None:
-    """March as `advance` does, with forces at the ends, whose motion the wheels follow."""
+    """Advance as `advance` does, with forces at the ends, whose motion the wheels follow."""
     for g in range(filters.feedback.shape[0]):
         _group_with_ends(filters, g, wheels, ends)

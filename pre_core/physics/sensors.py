@@ -196,7 +196,7 @@ def measure_position(
     """Return the fixes of `receiver` on a drive given at increasing times (n,).
 
     Fixes come every 1/rate from the first time. The earliest is the one whose true time, its stamp
-    less the latency, is the first within the drive. Random errors continue during an outage, so
+    minus the latency, is the first within the drive. Random errors continue during an outage, so
     that an outage changes no other fix.
     """
     count = int(np.floor((time_s[-1] - time_s[0]) * receiver.rate_hz + 1e-9)) + 1

@@ -1,6 +1,6 @@
 """The coupled forward problem: a half-car drives over a rough road and a bridge.
 
-Vehicle and bridge are each marched with Newmark's average acceleration; within every step they
+Vehicle and bridge are each integrated with Newmark's average acceleration; within every step they
 exchange wheel displacement and contact force until the forces converge (paper section 2.1).
 """
 

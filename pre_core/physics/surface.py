@@ -72,7 +72,7 @@ def spectra(front: Footprint, rear: Footprint, n: FloatArray) -> tuple[FloatArra
     """Return one-sided spectra (f,) in m³ at n > 0 cycles/m on a surface with Phi k^3 = 1 m².
 
     These are of the front axle, the rear axle, the real part of their cross spectrum, and their
-    difference front less rear.
+    difference front minus rear.
     """
     at_front, at_rear, n_y = _patches_and_waves(front, rear, n)
     of_front, of_rear = _strips(front, n_y), _strips(rear, n_y)

@@ -152,8 +152,8 @@ def _own_equations(
 ) -> ComplexArray:
     """Return the equations of a tandem with springs of its own, as `profile_equations`.
 
-    The last row is the moment about the front axle, a residual; the third one, of the front axle on
-    a flat road, is none.
+    The last row, the moment about the front axle, is a residual; the third one, of the front axle
+    on a flat road, is not.
     """
     load, on = shared_load(lead, theta, total_mass, gap), own_springs(lead, gap)
     s = 1j * omega
@@ -210,7 +210,7 @@ def _shared_equations(
     """Return the equations of an equalised tandem, as `profile_equations`.
 
     The last two rows are the body's equations at the front axle, on a flat road, and at the bogie,
-    and have their springs: they describe how the truck answers to its profiles, and are no
+    and have their springs: they describe how the truck responds to its profiles, and are not
     residuals.
     """
     load = shared_load(lead, theta, total_mass, gap)
@@ -241,7 +241,7 @@ def _shared_equations(
 def lead_response(lead: Lead, omega: FloatArray) -> ComplexArray:
     """Return the factor (f,) from ground to the front axle's motion at `omega` (f,).
 
-    Ground is the profile less the springs' force over the tyre's stiffness. The factor is the
+    Ground is the profile minus the springs' force over the tyre's stiffness. The factor is the
     inverse of G = 1 + m_u s²/k_u, damped towards the resonance: conj(G)/(|G|² + e²).
     """
     stiffness = lead.tyre_stiffness_n_per_m + 1j * omega * lead.tyre_damping_ns_per_m

@@ -274,11 +274,11 @@ def minimise(
     """Return the minimum near `start` (f,), reached when a step improves by less than `enough`.
 
     Where the mean square of the residuals exceeds `misfit`, an improvement by less than a
-    thousandth of the objective also ends the search: its exact minimum is of no use. Where no step
-    helps, forward differences have reached their rounding: a minimum too. With `is_followed` the
-    Jacobian is computed at the start, and then only where updates (`_follow`) fail. A step that
-    improves too little ends the search only with a fresh Jacobian. The Jacobian at the end need not
-    be fresh (`LMState.is_fresh`). No coordinate goes below `lower` (f,).
+    thousandth of the objective also ends the search: its exact minimum is not needed. Where no step
+    helps, forward differences have reached their rounding, which counts as a minimum. With
+    `is_followed` the Jacobian is computed at the start, and then only where updates (`_follow`)
+    fail. A step that improves too little ends the search only with a fresh Jacobian. The Jacobian
+    at the end need not be fresh (`LMState.is_fresh`). No coordinate goes below `lower` (f,).
     """
 
     def step(state: LMState) -> tuple[LMState, LMInfo]:

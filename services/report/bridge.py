@@ -98,8 +98,8 @@ def _check(path: Path, results: Results, site: Site) -> None:
         names = {f"EI_{n}" for n in range(1, elements + 1)}
         if crossing.parameters is not None and not names <= crossing.parameters.keys():
             raise InputError(
-                f"{path}: {crossing.crossing_id[:80]} does not have the {elements} elements that the "
-                f"site file gives {crossing.bridge}"
+                f"{path}: {crossing.crossing_id[:80]} does not have the {elements} elements that "
+                f"the site file gives {crossing.bridge}"
             )
         if not 0.0 <= crossing.entry_time < _LATEST_S:
             raise InputError(

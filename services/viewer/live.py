@@ -160,7 +160,8 @@ def _check_address(address: str) -> None:
         ip = ipaddress.IPv4Address(address)
     except ValueError:
         raise InputError(
-            f"--listen {address}: is not an IPv4 address; one of this machine is expected, such as 127.0.0.1"
+            f"--listen {address}: is not an IPv4 address; one of this machine is expected, such as "
+            "127.0.0.1"
         ) from None
     if not ip.is_loopback:
         _log.warning("%s is not authenticated: anyone who can reach it sees the view", address)

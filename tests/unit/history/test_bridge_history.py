@@ -190,8 +190,8 @@ def test_one_month_is_nothing_to_compare_with(
     assert capsys.readouterr().out.splitlines()[-2:] == [
         "Not monitored: driveby alarm check has not been run on this bridge.",
         (
-            "A change cannot be detected yet: fewer than two months have good crossings that can be "
-            "compared."
+            "A change cannot be detected yet: fewer than two months have good crossings that can "
+            "be compared."
         ),
     ]
 
