@@ -1,7 +1,7 @@
 """Fields of a protobuf message as nested dictionaries, for models whose fields have the same names.
 
 A None and an absent field are the same; names of enumerations are in lower case, and their zero,
-which says that nothing was given, is None.
+which means that no value was given, is None.
 """
 
 from collections.abc import Mapping

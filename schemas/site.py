@@ -337,7 +337,7 @@ class Site(Table):
     sensor: Sensor
     receiver: Receiver = Receiver()
     ros2: tuple[Ros2, ...] = ()
-    """Where messages of trucks with ROS 2 come from; says nothing of what they measure."""
+    """Sources of the messages of trucks with ROS 2, independent of their measurements."""
     imports: Annotated[Import | None, Field(alias="import")] = None
     """The realm of imported drives."""
 

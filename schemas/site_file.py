@@ -136,7 +136,7 @@ def _too_many(table: dict[str, Any]) -> str | None:
 def site_hash(site: Site) -> str:
     """Return 16 hex digits that change with any value, however the file is laid out.
 
-    But for `[ros2]` and `[import]`, which say by which way messages come and where they are filed,
+    But for `[ros2]` and `[import]`, which define the sources of messages and their realm,
     and nothing of what is in them.
     """
     values = site.model_dump(by_alias=True, exclude={"ros2", "imports", "vehicles"})

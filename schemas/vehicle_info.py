@@ -67,16 +67,16 @@ def differences(info_toml: str, known: Vehicle) -> list[InfoDifference]:
         table = parse_toml(info_toml, "info")
     except InputError:
         return []
-    said = next((one for one in _vehicles(table) if one.get("id") == known.id), {})
+    reported = next((one for one in _vehicles(table) if one.get("id") == known.id), {})
     try:
-        said = in_pairs(said)
+        reported = in_pairs(reported)
     except ValueError:
         return []
     found = []
     for name in _COMPARED:
         mine = _numbers(getattr(known, name))
-        theirs = _numbers(said.get(name))
-        spreads = _numbers(said.get(f"{name}_spread")) or [
+        theirs = _numbers(reported.get(name))
+        spreads = _numbers(reported.get(f"{name}_spread")) or [
             Vehicle.model_fields[f"{name}_spread"].default
         ]
         if len(mine) != len(theirs) or len(spreads) != 1:

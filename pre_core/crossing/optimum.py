@@ -84,8 +84,7 @@ _MAX_EVALUATIONS = 100_000
 """Limit of a whole search. The sample takes 2,000, a site file with two supports too many 65,000:
 beyond this a search has failed, and its numbers are not reliable."""
 _MAX_LINES = 3
-"""Limit of removed lines: hum and its harmonics. A record with more is not one of a truck on a
-road."""
+"""Limit of removed lines, hum and its harmonics: a truck on a road causes no more."""
 _SIMPLEST = SearchStrategy(SWING_MODES, True, 1, False)
 _WITHOUT_MISMATCH = (
     SearchStrategy(SWING_MODES - 1, True, 4, False),

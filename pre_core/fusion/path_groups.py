@@ -127,7 +127,7 @@ def _track(key: PathGroupKey, runs: list[FusionInput]) -> PathGroup:
 def _short_roots(
     runs: list[FusionInput], cycles_per_m: FloatArray, density: FloatArray
 ) -> dict[str, FloatArray]:
-    """Return roots of the covariance by short waves of a spectrum (g,), for runs with a response."""
+    """Return roots of the covariance by short waves of a spectrum (g,), of runs with a response."""
     have = {run.name: run.likelihood.short_waves for run in runs}
     responses = {name: one for name, one in have.items() if one is not None}
     if len(responses) < 2:

@@ -193,7 +193,7 @@ def _load_transfer_n(crossing: MeasuredCrossing, part: slice) -> FloatArray:
 def _drift_columns(
     t_front: FloatArray, t_rear: FloatArray, *, bias_known: bool
 ) -> list[FloatArray]:
-    """Return the effects of an unknown initial state on the residual, at the times of both axles."""
+    """Return the effects of an unknown initial state on the residual, at both axles' times."""
     columns = [np.ones_like(t_rear), t_front, t_rear]
     return columns if bias_known else [*columns, t_front**2, t_rear**2]
 

@@ -1,8 +1,8 @@
 """Detection of stale connections.
 
-Zenoh may accept a client again, after it had cut it off, into a session that it is about to close
-(eclipse-zenoh/zenoh#1886): the connection is up, but delivers nothing ever after. A process that
-only listens would take that for silence.
+Zenoh may accept a client that it had cut off into a session that it is about to close
+(eclipse-zenoh/zenoh#1886): the connection is up, but never delivers anything. A process that only
+listens would mistake that for silence.
 """
 
 from collections.abc import Set

@@ -1,4 +1,4 @@
-"""Messages of a realm for displays, which must never hold up a publisher.
+"""Messages of a realm for displays, which must never delay a publisher.
 
 If messages arrive too quickly the oldest are dropped, and missing ones are not requested. A stale
 connection is replaced.
@@ -80,10 +80,10 @@ class OtherRealms:
         while (token := self._tokens.try_recv()) is not None:
             self._note(str(token.key_expr), is_there=token.kind == zenoh.SampleKind.PUT)
         for _ in range(_OTHERS_WAITING):
-            said = next(self._named)
-            if said is None:
+            sample = next(self._named)
+            if sample is None:
                 return
-            self._note(said.key_text, is_there=None)
+            self._note(sample.key_text, is_there=None)
 
     def line(self) -> str | None:
         """Return a hint to trucks in other realms if this one is silent; None without any."""

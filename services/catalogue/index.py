@@ -182,12 +182,12 @@ def update_catalog(
 def _contradiction(folder: Folder, entry: Entry, row: CatalogRow, *, verify: bool) -> str | None:
     """Return how a row contradicts its file; None if it does not."""
     if entry.size_bytes != row.size_bytes:
-        return f"has {entry.size_bytes} bytes and not {row.size_bytes} as its row says"
+        return f"has {entry.size_bytes} bytes, not {row.size_bytes} as in its row"
     if entry.modified_ns == row.modified_ns and not verify:
         return None
     with opened(folder, entry.name) as file:
         if file_sha256(file) != row.content:
-            return "is another file than its row says, of the same size"
+            return "is not the file of its row, but of the same size"
     if verify:
         now = row_of(folder, entry)
         for what in CatalogRow._fields:
@@ -264,9 +264,9 @@ def _rows_of(content: bytes) -> list[CatalogRow]:
     try:
         return [_row(one) for one in decoded(content, _KEY, EDITION).to_pylist()]
     except KeyError as error:
-        raise ValueError(f"is no file of {_KEY} (lacks {error})") from None
+        raise ValueError(f"is not a file of {_KEY} (lacks {error})") from None
     except (TypeError, AttributeError) as error:
-        raise ValueError(f"is no file of {_KEY} ({error})") from None
+        raise ValueError(f"is not a file of {_KEY} ({error})") from None
 
 
 def _row(fields: dict[str, Any]) -> CatalogRow:

@@ -107,7 +107,7 @@ class _PositionReader:
             index = read_index(file, row.size_bytes)
             if index is None:
                 raise InputError(
-                    f"{self._folder.name}/{row.path}: has no index where its row says one is; "
+                    f"{self._folder.name}/{row.path}: has no index where its row has one; "
                     "driveby catalog mends the row"
                 )
             ours = {

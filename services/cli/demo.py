@@ -126,7 +126,7 @@ def _run(folder: Path, speed: float, noise: float, console: "Console", live: Liv
         _draw(folder, crossing, drive, site)
         status.stop()
         _print(console, crossing, drive, site)
-        _say_where(console, folder, time.monotonic() - began)
+        _print_outputs(console, folder, time.monotonic() - began)
         if view is not None:
             _wait_until_closed(view, console)
     return 0
@@ -149,10 +149,10 @@ def _view(services: _Services, live: Live) -> Iterator["_ChildProcess"]:
 def _wait_until_closed(view: "_ChildProcess", console: "Console") -> None:
     """Wait until the window is closed or the demo ended; results are printed before."""
     address = re.search(r"in a browser: (http://\S+)", view.log.read_text(errors="replace"))
-    said = "The live view stays until its window is closed, or Ctrl-C."
+    notice = "The live view stays until its window is closed, or Ctrl-C."
     if address is not None:
-        said = f"The live view stays until Ctrl-C, at {address[1]}"
-    console.print(f"\n{said}", highlight=False, soft_wrap=True)
+        notice = f"The live view stays until Ctrl-C, at {address[1]}"
+    console.print(f"\n{notice}", highlight=False, soft_wrap=True)
     code: int | None = None
     with contextlib.suppress(KeyboardInterrupt):
         code = view.process.wait()
@@ -185,11 +185,11 @@ def _free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def _live(services: _Services, source: Path, speed: float, say: _Printer) -> CrossingResult:
+def _live(services: _Services, source: Path, speed: float, show: _Printer) -> CrossingResult:
     """Run the three processes until the result has been received; return it."""
     endpoint, site, folder, method = services
     common = ["--realm", REALM, "--site", str(site)]
-    say("starting the logger, which hosts the router")
+    show("starting the logger, which hosts the router")
     with contextlib.ExitStack() as stack:
         logger = stack.enter_context(
             _process(
@@ -203,7 +203,7 @@ def _live(services: _Services, source: Path, speed: float, say: _Printer) -> Cro
         bridge = stack.enter_context(
             Subscription(bus, f"driveby/v1/{REALM}/bridge/**", capacity=1000)
         )
-        say("starting the worker (the very first start compiles its kernels)")
+        show("starting the worker (the very first start compiles its kernels)")
         worker = stack.enter_context(
             _process(
                 folder,
@@ -213,7 +213,7 @@ def _live(services: _Services, source: Path, speed: float, say: _Printer) -> Cro
             )
         )
         _wait(health, lambda received: True, [logger, worker], _READY_S, "the worker is not ready")
-        say(f"the truck drives, at {speed:g} times real speed")
+        show(f"the truck drives, at {speed:g} times real speed")
         truck = stack.enter_context(
             _process(
                 folder,
@@ -227,13 +227,13 @@ def _live(services: _Services, source: Path, speed: float, say: _Printer) -> Cro
             if received.key().stream == "crossing":
                 state = decode("driveby.v1.Crossing", received.payload)
                 assert isinstance(state, pb.Crossing)  # noqa: S101 - by `decode`
-                say(f"crossing {pb.CrossingState.Name(state.state).lower().replace('_', ' ')}")
+                show(f"crossing {pb.CrossingState.Name(state.state).lower().replace('_', ' ')}")
             return received.key().stream == "estimate"
 
         estimate = _wait(
             bridge, is_estimate, [logger, worker, truck], _RESULT_S, "no result was received"
         )
-        say("stopping")
+        show("stopping")
         _finish(truck, None)
         _finish(worker, signal.SIGTERM)
         health.close()
@@ -413,7 +413,7 @@ def _print(console: "Console", crossing: CrossingResult, drive: SimulatedDrive, 
         console.print(f"verdict {crossing.verdict} ({code}): {text}", highlight=False)
 
 
-def _say_where(console: "Console", folder: Path, seconds: float) -> None:
+def _print_outputs(console: "Console", folder: Path, seconds: float) -> None:
     lines = [
         f"\n{folder}/ ({seconds:.0f} s)",
         f"  {_RECORDING:<16} recording by the logger; driveby identify {folder / _RECORDING}",

@@ -20,37 +20,37 @@ MAX_PROCESSES: Final = 256
 
 def check_scheduler(options: IdentifyOptions) -> None:
     """Raise InputError for an invalid `--scheduler`, before anything is started."""
-    said: str | None = options.scheduler
-    is_cluster = said is not None and said.partition(":")[0] != _PROCESSES
+    given: str | None = options.scheduler
+    is_cluster = given is not None and given.partition(":")[0] != _PROCESSES
     for name in ("tls", "batch", "reconnect_timeout"):
         if getattr(options, name) is not None and not is_cluster:
             raise InputError(
                 f"{option_of(name)}: belongs to a cluster, --scheduler tcp://… or tls://…"
             )
-    if said is not None and not is_cluster:
-        _number(said)
+    if given is not None and not is_cluster:
+        _number(given)
     if is_cluster:
         from services.execution.scheduler import check_address
 
-        check_address(str(said), _credentials(options))
+        check_address(str(given), _credentials(options))
 
 
 @contextmanager
 def execution_of(options: IdentifyOptions) -> "Iterator[CrossingExecutor | None]":
     """Run the executor of `--scheduler`, started at entry; None without the option."""
-    said: str | None = options.scheduler
-    if said is None:
+    given: str | None = options.scheduler
+    if given is None:
         yield None
-    elif said.partition(":")[0] == _PROCESSES:
+    elif given.partition(":")[0] == _PROCESSES:
         from services.execution.processes import ProcessExecutor
 
-        with ProcessExecutor(_number(said)) as processes:
+        with ProcessExecutor(_number(given)) as processes:
             yield processes
     else:
         from services.execution.cluster import BATCH, PATIENCE_S, DaskExecutor
 
         with DaskExecutor(
-            said,
+            given,
             credentials=_credentials(options),
             batch=options.batch or BATCH,
             patience_s=options.reconnect_timeout or PATIENCE_S,
@@ -71,16 +71,16 @@ def credentials_of(folder: Path, role: str) -> "Credentials":
     return Credentials(folder / AUTHORITY, folder / CERTIFICATE, folder / KEY)
 
 
-def _number(said: str) -> int:
-    _, _, text = said.partition(":")
-    if said == _PROCESSES:
+def _number(given: str) -> int:
+    _, _, text = given.partition(":")
+    if given == _PROCESSES:
         return cores()
     try:
         number = int(text)
     except ValueError:
         number = 0
     if not 1 <= number <= MAX_PROCESSES:
-        raise InputError(f"--scheduler: is {said!r}, the number must be from 1 to {MAX_PROCESSES}")
+        raise InputError(f"--scheduler: is {given!r}, the number must be from 1 to {MAX_PROCESSES}")
     return number
 
 

@@ -230,9 +230,9 @@ def _bridges(bridges: dict[str, BridgeRow], standing: Set[str]) -> Table:
     quiet = [name for name in bridges if name not in standing]
     for name in (*alarmed, *quiet[max(0, len(quiet) + len(alarmed) - _MAX_BRIDGES) :]):
         row = bridges[name]
-        said = row.finding or row.lowest
+        wording = row.finding or row.lowest
         is_good = row.verdict in ("", "good")
-        found = Text(said if is_good else f"{row.verdict}: {said}", overflow="fold")
+        found = Text(wording if is_good else f"{row.verdict}: {wording}", overflow="fold")
         found.no_wrap = False
         heights = bars(row.ratios, row.weak, doubtful=not is_good)
         head = Text(name, style="bold red" if name in standing else "")
@@ -268,8 +268,8 @@ def _services(model: RealmModel, now_ns: int) -> Table:
             state = Text(f"silent {_length(age_s)}", style="red")
         elif not service.ok:
             state = Text("not well", style="red")
-        said = [service_figures(service), model.work.get(name, "")]
-        table.add_row(name, state, "; ".join(one for one in said if one))
+        notes = [service_figures(service), model.work.get(name, "")]
+        table.add_row(name, state, "; ".join(one for one in notes if one))
     return table
 
 

@@ -104,7 +104,7 @@ class Bridges:
         return self._bridges[number]
 
     def frame(self, number: int) -> BridgeFrame:
-        """Return its coordinates, computed at the first request."""
+        """Return the coordinates of a bridge, computed at the first request."""
         if number not in self._frames:
             self._frames[number] = bridge_frame(self._bridges[number])
         return self._frames[number]
@@ -270,7 +270,7 @@ class Bridges:
         return hypot(aside_m, heights[0])
 
     def _visits(self, fixes: Fixes) -> dict[int, list[Fixes]]:
-        """Return by bridge the parts of a drive near it, with a while before and after."""
+        """Return by bridge the parts of a drive near it, with a margin before and after."""
         near: dict[int, list[int]] = {}
         place = np.column_stack([fixes.latitude_deg, fixes.longitude_deg]).tolist()
         for n, here in enumerate(place):

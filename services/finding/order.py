@@ -3,7 +3,7 @@
 A recording keeps the order of arrival, an identification needs that of measurement: a spool
 delivers late what could not be sent at once. So the order is determined first, at sixteen bytes a
 message, and data required from the beginning are kept: the trucks' descriptions, and their
-positions near bridges. Then the messages are read again, and one that came too early waits for
+positions near bridges. Then the messages are read again, and one that arrived too early waits for
 those before it. The memory grows with the late messages, not with the length of the drive. Small
 recordings are kept and not read twice.
 """

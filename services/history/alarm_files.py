@@ -43,7 +43,7 @@ def alarms_of(folder: Path, realm: str, bridge: str) -> tuple[list[Alarm], list[
 
 
 def _load(path: Path, realm: str, bridge: str) -> Alarm:
-    """Return the alarm of a file; InputError if it is none, or another one than its name says."""
+    """Return the alarm of a file; InputError if it is not one, or not that of its name."""
     alarm = load_json(Alarm, path, "an alarm")
     if (alarm.realm, alarm.bridge, alarm.alarm_id) != (realm, bridge, path.stem):
         raise InputError(

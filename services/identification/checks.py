@@ -24,10 +24,10 @@ from services.identification.signal_checks import body_constants
 _BANDS_HZ = np.array([0.0, 6.0, 12.0, 30.0, np.inf])
 """Frequency bands. The motion of bridge, body and wheels is mostly in the first three."""
 _FALSE_ALARM_Z = 4.5
-"""Threshold that one of 36 cells exceeds by chance in 1e-4 of the crossings."""
+"""Threshold that one of 36 residual bins exceeds by chance in 1e-4 of the crossings."""
 _SLACK = (1.35, 1.35, 1.35, 1.15)
 """Tolerated noise power of each band, relative to the declared one. The declared density comes from
-a data sheet, which leaves out the 1/f noise of the sensor."""
+a data sheet, which omits the sensor's 1/f noise."""
 _SLACK_OF_TWO_ROADS = 1.6
 """Tolerated power where the axles' profiles differ: three standard deviations of a mismatch level
 estimated from some ten waves."""
@@ -42,19 +42,19 @@ _SMALLEST_CHI2 = 0.6
 """Smallest chi2 per degree of freedom without noise far below the declared, which makes intervals
 too wide."""
 _LARGEST_VEHICLE_Z = 4.0
-"""Largest plausible distance of a truck's unknown from its prior, in standard deviations."""
+"""Largest plausible distance of a truck's parameter from its prior, in standard deviations."""
 _MAX_NAMED = 3
 _LARGEST_POSITION_Z = 4.0
 """Largest plausible slow error of the receiver, in standard deviations."""
 _LARGEST_STEP_Z = {slip.DELAY: 6.0, slip.GAIN: 7.0}
-"""Largest tolerated step in the delay or gain of a channel, in standard deviations for rows of the
-estimated variance. Sound: at most 3.5; one lost sample of 1 kHz: 6.8 to 38."""
+"""Largest tolerated step in the delay or gain of a channel, in standard deviations for residuals of
+the estimated variance. Fault-free: at most 3.5; one lost sample of 1 kHz: 6.8 to 38."""
 _SHORTEST_SLIP_S = 1e-4
-"""Change of a delay below which no sample was lost, of up to 10 kHz, and that no bridge shows:
+"""Change of a delay that is less than one lost sample at 10 kHz, and has no effect on the bridge:
 delays are known to 0.5 ms. A plate that bends across its axis resembles a step of 0.03 ms."""
 _LARGEST_SPEED_SCALE_Z = 5.0
 """Largest tolerated difference between the receiver's speeds and the derivative of its positions,
-in standard deviations. Sound: at most 2."""
+in standard deviations. Fault-free: at most 2."""
 _RECEIVER_ASIDE_S = 4.0
 """Time before and after the bridge over which fixes are compared; the fit uses the same."""
 _SPEED_SCALE_SPREAD = 0.002
@@ -62,8 +62,8 @@ _SPEED_SCALE_SPREAD = 0.002
 axis."""
 _LARGEST_SPEED_BIAS, _LARGEST_SPEED_BIAS_Z = 1.0, 5.0
 """Largest tolerated mean difference between the receiver's speeds and the fit's, in multiples of
-their noise and of the standard error of the mean. Sound: at most 0.3 at ten fixes a second; speeds
-3 % high: 1.3 to 3.7."""
+their noise and of the standard error of the mean. Fault-free: at most 0.3 at ten fixes a second;
+speeds 3 % high: 1.3 to 3.7."""
 _COMMON = 0.7
 """Largest tolerated coherence between the residuals of the body equations, where they exceed the
 sensors' noise. Dry friction and nonlinear dampers: -0.13 to 0.28; tilted sensors on a truck that
@@ -81,12 +81,12 @@ _CLEARLY = 0.025
 _UNDECLARED, _PLAINLY_UNDECLARED = 0.12, 0.3
 _REAR_OVER_FRONT = 2.5
 """Unexplained part of the rear body's motion, alone and relative to the front's. Sixteen
-semitrailers and tandems declared with two axles: 0.15 to 1.3, 1.9 to 190 times the front's. Sound
-trucks: at most 0.05, with dry friction 0.21. Between the first and the second threshold it is a
-cause to name where another check fails, and no reason by itself."""
+semitrailers and tandems declared with two axles: 0.15 to 1.3, 1.9 to 190 times the front's.
+Two-axle trucks: at most 0.05, with dry friction 0.21. Between the first and the second threshold it
+is a cause to name where another check fails, and no reason by itself."""
 _LED_AWAY = 40.0
-"""Largest tolerated correction for the mismatch, in multiples of a prior's spread. Sound: at most
-3; trailers and searches that diverged: 540 to 13,000."""
+"""Largest tolerated correction for the mismatch, in multiples of a prior's spread. Fault-free: at
+most 3; trailers and searches that diverged: 540 to 13,000."""
 _MISMATCH_EXCESS = 30.0
 """Largest tolerated ratio of measured to declared mismatch power: tyres twice as wide as declared,
 or tracks that differ by 20 cm where they are declared equal."""
@@ -114,19 +114,19 @@ class Fit(NamedTuple):
     """Whitened residuals (m, 3): profile mismatch, front and rear body equation. Their variance is
     one for the noise that the site file declares; not inflated."""
     step_s: float
-    """Time between rows."""
+    """Time between residuals."""
     place_m: Floats
-    """Chainage (m,) at which a row compares the profiles: the rear axle's at the middle of the
-    row."""
+    """Chainage (m,) at which a residual compares the profiles: the rear axle's at the middle of the
+    filter."""
     chi2_per_dof: float
     prior_z: dict[str, float]
-    """Unknowns of the truck, c_s1 … kappa and wheelbase, in multiples of their prior's spread."""
+    """Parameters of the truck, c_s1 … kappa and wheelbase, in multiples of their prior's spread."""
     position_z: float
     """Slow error of the receiver in multiples of its spread."""
     rigidity_spread: Floats
     """Standard deviation of ln EI (elements,), relative to the prior's."""
     has_two_roads: bool
-    """Whether the rows off the bridge showed that the axles' profiles differ."""
+    """Whether the residuals off the bridge show that the axles' profiles differ."""
     off_bridge_m: float
     """Length of road off the bridge from which the mismatch was estimated."""
     speed_bias: float = 0.0
@@ -138,7 +138,7 @@ class Fit(NamedTuple):
     mismatch_excess: float = 0.0
     """Power of the mismatch off the bridge, relative to that of the declared axles."""
     mismatch_bias: float = 0.0
-    """Largest correction of a truck's unknown for the mismatch, in multiples of its prior's
+    """Largest correction of a truck's parameter for the mismatch, in multiples of its prior's
     spread."""
     pavement_ratio: float = 1.0
     """Amplitude of the mismatch on the bridge over that off it, in waves of a metre."""
@@ -248,7 +248,7 @@ def steps_of_channels(names: tuple[str, ...], fit: Fit) -> dict[Reason, str]:
 
 
 def stiffer_elements(ratio: Floats) -> list[int]:
-    """Return the elements whose draws (k, n) of EI over nominal no damage explains.
+    """Return the elements whose draws (k, n) of EI over nominal are implausibly high.
 
     Such an element exceeds both its nominal value and the median of the others by `_STIFFER`, with
     a probability of at least 1 - `_CLEARLY`. Low values alone, however low, never make another
@@ -289,22 +289,22 @@ def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
 
 
 def _slack(fit: Fit, kind: int, stretch: int, band: int) -> float:
-    """Return the tolerated power of a cell, relative to the expected one."""
+    """Return the tolerated power of a residual bin, relative to the expected one."""
     return _SLACK[band] * (_SLACK_OF_TWO_ROADS if fit.has_two_roads and kind == ROAD else 1.0)
 
 
 def _stretches(data: CrossingData, fit: Fit) -> NDArray[np.int64]:
-    """Return for each row (m,) whether it lies before, on or after the bridge."""
+    """Return for each residual (m,) whether it lies before, on or after the bridge."""
     span = data.bridge.span_m
     travelled = fit.place_m if data.stay.direction > 0 else span - fit.place_m
     return np.where(travelled < 0.0, BEFORE, np.where(travelled > span, AFTER, ON)).astype(np.int64)
 
 
 def _is_only_noise(fit: Fit, found: dict[tuple[int, int, int], quality.ResidualBin]) -> bool:
-    """Return whether noise of more than the declared power alone explains the rows.
+    """Return whether noise of more than the declared power alone explains the residuals.
 
-    The power is estimated from the highest band, which holds nothing but noise. It may differ
-    between the kinds of residuals, as the sensors do, and must fit all other cells.
+    The power is estimated from the highest band, which contains only noise. It may differ between
+    the kinds of residuals, as the sensors do, and must fit all other bins.
     """
     top = _BANDS_HZ.size - 2
     powers = []

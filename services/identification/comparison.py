@@ -25,7 +25,7 @@ IMPLAUSIBLE_GAIN = 0.2
 """Gain above which no whole 95 % interval of an element is plausible: from summer to winter,
 30 K, the stiffness of concrete and asphalt rises by some 12 %."""
 _FEWEST_ELEMENTS = 3
-"""Fewest elements: of two the undamaged one cannot be identified."""
+"""Fewest comparable elements: of two, the undamaged one cannot be identified."""
 
 
 def shared_crossings(used: Set[str], before: Set[str], language: Language = ENGLISH) -> str | None:
@@ -82,7 +82,7 @@ class Element(NamedTuple):
 
     @property
     def is_lower(self) -> bool:
-        """Whether its interval excludes no loss at all, but not a loss that is too small."""
+        """Whether its interval excludes zero loss, but includes losses below `CLEAR_LOSS`."""
         return self.high < 1.0 and not self.is_weak
 
     @property
@@ -292,7 +292,7 @@ def _smallest_seen(elements: Sequence[Element]) -> int:
 
 
 def per_cent_up(share: float) -> int:
-    """Return a share in per cent, rounded up: so much and no less is sure to be seen."""
+    """Return a share in per cent, rounded up: a loss of that size is certain to be detected."""
     return int(np.ceil(100.0 * share - 1e-6))
 
 

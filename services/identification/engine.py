@@ -47,7 +47,7 @@ class Engine:
 
     The engine identifies nothing itself: it yields a task for each crossing, whose result is passed
     to `done`, at any later time and in any order. It does not fuse either: after a result it yields
-    a fusion, whose state is passed to `fused`; those of a bridge in their order, and one may be
+    a fusion, whose state is passed to `fused`: states of a bridge in their order, and one may be
     skipped for a later one. `services.execution` executes both.
 
     `header` is the head of every estimate, `fusing` the settings of fusions. Without
@@ -240,7 +240,7 @@ class Engine:
         return self._waiting.has_released
 
     def release(self) -> Iterator[EngineOutput]:
-        """Continue the first crossing that has waited and need not any more, if there is one.
+        """Continue the first waiting crossing that need not wait any longer, if there is one.
 
         One at a time: the caller receives messages in between.
         """

@@ -33,7 +33,7 @@ def observation_of(result: CrossingResult) -> Observation | None:
 
 
 def _named_shortly(of: Observation) -> Observation:
-    """Return it with short names: a truck's key identifies it completely, in 1 kB."""
+    """Return the observation with short names: a truck's key identifies it completely, in 1 kB."""
     shared = tuple(
         one._replace(name=f"{one.name.split(' ', 1)[0]}-{_digest(one.name)}") for one in of.shared
     )

@@ -80,7 +80,7 @@ _FREQUENCY_DRAWS = 1000
 """Draws for frequencies: 25 beyond each end of the interval; each costs an eigenvalue problem."""
 
 Keep = Callable[[str, dict[str, Floats]], None]
-"""Receiver of the draws of a crossing: its identifier and, by name, each unknown's (chains,
+"""Receiver of the draws of a crossing: its identifier and, by name, each parameter's (chains,
 draws)."""
 
 
@@ -158,7 +158,7 @@ def _parts(bridge: Bridge) -> int:
 
 
 def _priors(data: CrossingData) -> posterior.Priors:
-    """Return the priors of all unknowns of the parameter table."""
+    """Return the priors of all parameters of the table."""
     vehicle, bridge = data.vehicle, data.bridge
     of = {parameters.TRUCK: vehicle, parameters.BRIDGE: bridge}
     rows = parameters.table(bridge.elements)
@@ -405,7 +405,7 @@ def _level(bridge: Bridge, theta: Floats, begin: float, end: float) -> Floats:
 
 
 def _probability_of(theta: Floats, place: int) -> results.AtEnds:
-    """Return the share of draws (k, p) in which each of a pair of unknowns is not zero."""
+    """Return the share of draws (k, p) in which each of a pair of parameters is not zero."""
     start, end = (theta[:, place : place + 2] > 0.0).mean(axis=0)
     return results.AtEnds(start=float(start), end=float(end))
 

@@ -49,9 +49,9 @@ Fault-free: 0.71 to 0.99 (with the axles swapped: -0.72 to 0.49).
 
 _FOLLOWS = 0.25
 """Correlation of a tandem's axles at one place, and of the body in front with a mass on its springs
-over their road. Axles: sound 0.34 to 0.77, swapped -0.30 to 0.15. Body, of 30 drawn crossings: 0.3
-to 0.95, inverted the same below zero. What the bogie's equation leaves over: sound 0.04 to 0.16,
-another reading inverted or swapped 0.37 to 0.98."""
+over their road. Axles: fault-free 0.34 to 0.77, swapped -0.30 to 0.15. Body, of 30 drawn crossings:
+0.3 to 0.95, inverted the same below zero. Unexplained share of the bogie's equation: fault-free
+0.04 to 0.16, another reading inverted or swapped 0.37 to 0.98."""
 
 
 def reasons_before_fit(

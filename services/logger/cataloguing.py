@@ -2,8 +2,8 @@
 
 A row requires reading the file once more, with packages that would add half of the logger's memory
 to it and never give it back. So a process of low priority writes the rows of all files that were
-closed within a minute. Those left at the logger's end are written in this process, up to a size
-that does not hold up its end.
+closed within a minute. Those left when the logger ends are written in this process, up to a size
+that does not delay the end.
 """
 
 import contextlib

@@ -94,8 +94,8 @@ class Intake:
             stamp = check_stamp(row, received.payload)
             if stamp.identity not in (None, identity):
                 raise ValueError(
-                    f"{row.owner}/{row.stream}: the payload says {stamp.identity[0]}, "
-                    f"{stamp.identity[1]} where its attachment says {identity[0]}, {identity[1]}"
+                    f"{row.owner}/{row.stream}: the payload has {stamp.identity[0]}, "
+                    f"{stamp.identity[1]} where its attachment has {identity[0]}, {identity[1]}"
                 )
             stream = self._streams.of(where, identity, now_ns)
             if not received.recovered:

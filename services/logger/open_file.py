@@ -14,7 +14,7 @@ from services.recordings.writer import Misplaced, RecordingWriter
 _log = logging.getLogger(__name__)
 
 
-class WriteFailed(Exception):  # noqa: N818  # says what happened, as OSError does not
+class WriteFailed(Exception):  # noqa: N818  # states what happened, as OSError does not
     """Writing failed, with the file at fault; without a name it was the disk."""
 
     def __init__(self, name: FileName | None, reason: str, kind: EventKind) -> None:
@@ -50,7 +50,7 @@ class OpenFile:
 
 
 def synced(name: FileName, opened: OpenFile) -> Misplaced | None:
-    """Sync a file; return what has become of it, if it is not in its place."""
+    """Sync a file; return its displacement, None if it is in its place and complete."""
     with failing(name):
         opened.file.sync()
         return opened.file.displacement()

@@ -250,7 +250,7 @@ def _report(logger: _Logger, announcements: "_Announcements", *, closing: bool) 
 class _Announcements:
     """Publisher thread of `durable`, `event` and `health`.
 
-    A put to a congested connection blocks, which must hold up neither receiving nor writing.
+    A put to a congested connection blocks, which must delay neither receiving nor writing.
     """
 
     def __init__(self, bus: zenoh.Session, logger: _Logger, completeness: Completeness) -> None:

@@ -32,7 +32,7 @@ _DISK_CHECK_S = 1.0
 
 
 class FileWriter:
-    """A thread that writes messages, so that a slow disk does not hold up the bus."""
+    """A thread that writes messages, so that a slow disk does not delay the bus."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class FileWriter:
         self.unwritten = self._files.unwritten
         """Messages for which there was no file: they may come again. The caller empties it."""
         self.unpublished = self._files.unpublished
-        """Events that this thread has written down itself and that are to be published."""
+        """Events that this thread has written itself and that are to be published."""
         self.limits = limits
         self.room = DiskRoom(place.top, limits.min_free_bytes, disk)
         self._rotation_asked = threading.Event()

@@ -317,7 +317,7 @@ def _chunk_at(file: BinaryIO, at: int, size: int, outer_end: int | None) -> _Mca
     if head[_FRAME_AT:] == _FRAME or head[_ZSTD_AT : _ZSTD_AT + len(_ZSTD)] == _ZSTD:
         begin = at + _FRAME_AT
         inner_end = begin + _LENGTH.unpack_from(head, _FRAME_AT - _LENGTH.size)[0]
-        # The shorter first: what is compressed says itself where it ends, so that too many bytes
+        # The shorter first: compressed data mark their own end, so that too many bytes
         # decompress as well as the right ones.
         ends = sorted({end for end in (inner_end, outer_end) if end is not None})
         attempts += [(True, begin, end) for end in ends]

@@ -259,8 +259,8 @@ def _scan(
             if isinstance(item, RawMessage):
                 if item.channel_id not in channels and not has_looked:
                     has_looked = True
-                    # The chunk that said it is lost. Ours say it again in every chunk; of older
-                    # files only the summary does.
+                    # The chunk that declared it is lost. Every chunk of ours declares it again; of
+                    # older files only the summary does.
                     everywhere = find_channels(path).items()
                     channels |= {
                         n: our_channel(path, c, warn) for n, c in everywhere if n not in channels

@@ -220,10 +220,10 @@ class _Copier:
         written = self._writer.messages + self._writer.pending
         lost: int | None = None
         if self._end is not None:
-            said = self._end.get("messages", "")
-            if said.isascii() and said.isdecimal():
+            stated = self._end.get("messages", "")
+            if stated.isascii() and stated.isdecimal():
                 # Not negative: the number itself may be damaged.
-                lost = max(0, int(said) - written)
+                lost = max(0, int(stated) - written)
         elif self._lost_by_index or self._unknown:
             lost = self._lost_by_index + self._unknown
         recovery = Recovery(

@@ -19,6 +19,6 @@ AMONG_ALL: Final = (
 TORSION: Final = "torsion"
 LEFT_AND_RIGHT: Final = "left-and-right"
 ON_SURFACES: Final = (SURFACE, TORSION, LEFT_AND_RIGHT, PAVEMENT)
-"""Not parts of everything, whose answers on such a road would say little of the rest."""
+"""Effects that `everything` leaves out: results on such a road would show little of the others."""
 ALONE: Final = (*AMONG_ALL, *ON_SURFACES)
 EFFECTS: Final = (*ALONE, EVERYTHING)

@@ -47,5 +47,5 @@ def decode_attachment(attachment: bytes | None) -> Attachment:
         raise ValueError(f"has an attachment of {len(attachment)} bytes, 33 are expected")
     sequence, sent_ns, length = _NUMBERS.unpack_from(attachment)
     if length != size:
-        raise ValueError(f"has an attachment whose array is said to be {length} bytes, not {size}")
+        raise ValueError(f"has an attachment whose array has {length} bytes, not {size}")
     return Attachment(sequence, sent_ns, attachment[_NUMBERS.size :])

@@ -146,7 +146,7 @@ def _read_vehicle(
     if not streams:
         raise InputError(f"{recording}: no vehicle {vehicle!r}; it holds {names}")
     if vehicle is None and len(vehicles) > 1:
-        raise InputError(f"{recording}: several vehicles; say which: {names}")
+        raise InputError(f"{recording}: several vehicles; name one with --vehicle: {names}")
     for messages in streams.values():
         messages.sort(key=lambda message: (message.boot_id, message.sequence))
     return streams

@@ -229,7 +229,7 @@ def comparison_of(crossing: CrossingView, baseline: Estimate | None = None) -> C
 
 
 def describe_crossing(crossing: CrossingView, found: Comparison | None) -> list[str]:
-    """Return sentences on one crossing; only resolved elements are said to agree."""
+    """Return sentences on one crossing; only resolved ones can agree."""
     if found is None:
         return []
     if crossing.resolution is None:

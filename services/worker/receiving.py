@@ -132,6 +132,6 @@ def _check_whole(payload: bytes, key: Key, identity: Identity) -> None:
     message = TRUCK_DECODERS[key.stream](payload)
     if (message.boot_id, message.sequence) != identity:
         raise ValueError(
-            f"says that it is {message.sequence} of boot {message.boot_id}, and came as "
+            f"claims to be {message.sequence} of boot {message.boot_id}, and came as "
             f"{identity.sequence} of boot {identity.boot_id}"
         )

@@ -228,8 +228,8 @@ def _lines(past: "BridgeHistory") -> Iterator[str]:
         yield f"{head}  {one.state.verdict:<8} {cells}"
     for alarm in alarms:
         yield alarm_line(alarm)
-    for said in statements(past):
-        yield said.text
+    for statement in statements(past):
+        yield statement.text
 
 
 def _csv(periods: "Sequence[FusedPeriod]") -> Iterator[str]:

@@ -83,7 +83,7 @@ def _show_page(
 
 
 def _print_lines(
-    listening: "RealmListener", stop: threading.Event, say: Callable[[str], None]
+    listening: "RealmListener", stop: threading.Event, write: Callable[[str], None]
 ) -> None:
     from services.bus.realm_listener import other_realms_hint
     from services.cli.realm_model import RealmModel
@@ -95,7 +95,7 @@ def _print_lines(
 
     def print_line(line: str | None) -> None:
         if line is not None:
-            say(f"{datetime.now(UTC):%H:%M:%S} {line}")
+            write(f"{datetime.now(UTC):%H:%M:%S} {line}")
 
     while not stop.is_set():
         for heard in listening.heard():

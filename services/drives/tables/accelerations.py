@@ -99,7 +99,7 @@ def as_declared(
             one.gravity_included is not None or one.up is not None
         ):
             raise InputError(
-                f"{part.sheet.path}: {name} of the map is said to "
+                f"{part.sheet.path}: {name} of the map is declared to "
                 f"{'have' if declared_as[name].is_included else 'be without'} gravity, its mean is "
                 f"{float(np.mean(channels[name])):.3g} m/s²"
             )
@@ -107,7 +107,7 @@ def as_declared(
     for gravity in dict.fromkeys(seen.values()):
         names = [name for name in channels if seen[name] == gravity != declared_as[name]]
         if names:
-            text = f"{_described(gravity)} {', '.join(names)}, [sensor] says otherwise"
+            text = f"{_described(gravity)} {', '.join(names)}, contrary to [sensor]"
             found.guess(owner[names[0]], text)
     declared = {}
     for name, values in channels.items():

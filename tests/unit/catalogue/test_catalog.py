@@ -192,7 +192,7 @@ def test_mending_names_what_is_gone_and_changed(fleet: Path, site: Site) -> None
     gone, smaller, *damaged = mended.problems
     assert gone.endswith("a.mcap: is gone; its row is dropped")
     assert "b.mcap: has " in smaller
-    assert damaged[0].endswith("is another file than its row says, of the same size; "
+    assert damaged[0].endswith("is not the file of its row, but of the same size; "
                                "its row is made anew")  # fmt: skip
     assert "c.mcap: damaged chunk" in damaged[1]
     assert read_catalog(folder).rows == mended.rows
@@ -286,7 +286,7 @@ def test_files_that_are_no_rows_get_a_line_and_stay(fleet: Path) -> None:
     newer, cut = sorted(mended.problems)
     assert newer.endswith("other.parquet: left out: is of edition 2 of driveby.catalog, this "
                           "program knows 1")  # fmt: skip
-    assert "torn.parquet: left out: is no file of driveby.catalog" in cut
+    assert "torn.parquet: left out: is not a file of driveby.catalog" in cut
     assert torn.exists()
     assert other.exists()
 

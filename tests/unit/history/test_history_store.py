@@ -151,8 +151,8 @@ def test_damaged_files_and_other_editions_get_a_line_and_stay(
     read = read_partition(where(tmp_path))
     assert len(read.crossings) == 2
     lines = "\n".join(read.problems)
-    assert f"{torn}: left out: is no file of driveby.history" in lines
-    assert f"{noise}: left out: is no file of driveby.history" in lines
+    assert f"{torn}: left out: is not a file of driveby.history" in lines
+    assert f"{noise}: left out: is not a file of driveby.history" in lines
     assert "left out: is of edition 2 of driveby.history, this program knows 1" in lines
     assert len(read.problems) == 3
     # What is lost is added again; what cannot be read is never removed.

@@ -193,7 +193,7 @@ def test_payload_and_attachment_must_agree() -> None:
     assert intake.accept(forged, NOW_NS) is None
     [(_, event)] = intake.report(*at(0.0))
     assert event.kind == EventKind.REFUSED
-    assert "the payload says 1, 7 where its attachment says 1, 8" in event.text
+    assert "the payload has 1, 7 where its attachment has 1, 8" in event.text
     assert intake.accept(message(8), NOW_NS) is not None
 
 
