@@ -69,7 +69,7 @@ def read_ros2(source: Path, truck: Ros2Truck) -> Iterator[RosMessage]:
     """
     from rosbags.rosbag2 import Reader
 
-    for path in _files_of(source):
+    for path in (source, *(sorted(source.iterdir()) if source.is_dir() else ())):
         _check_file(path)
     if source.is_dir():
         _check_metadata(source / "metadata.yaml")
@@ -96,10 +96,6 @@ def read_ros2(source: Path, truck: Ros2Truck) -> Iterator[RosMessage]:
             yield RosMessage(connection.topic, types[connection.id], payload, recorded_ns)
     finally:
         reader.close()
-
-
-def _files_of(source: Path) -> list[Path]:
-    return [source, *sorted(source.iterdir())] if source.is_dir() else [source]
 
 
 def _check_file(path: Path) -> None:

@@ -85,7 +85,9 @@ def run(asked: TruckSettings, *, connect_timeout_s: float | None = CONNECT_TIMEO
             )
         else:
             bus = partial(open_session, connect=asked.address, timeout_s=0.0, tls=asked.tls)
-        spool = _open_spool(asked.spool, asked.spool_budget << 20)
+        spool = None
+        if asked.spool is not None:
+            spool = Spool(asked.spool, budget_bytes=asked.spool_budget << 20)
         gateway = Gateway(bus, realm, vehicle, spool)
         stack.callback(gateway.close)
         times = _times(streams, asked.speed, skip_gaps=asked.skip_gaps)
@@ -124,10 +126,6 @@ def _publish(
     return publish_paced(
         messages, put, gateway.delivery, speed=asked.speed, stop=stop, longest_gap_s=longest_gap_s
     )
-
-
-def _open_spool(folder: Path | None, budget_bytes: int) -> Spool | None:
-    return None if folder is None else Spool(folder, budget_bytes=budget_bytes)
 
 
 def _read_vehicle(

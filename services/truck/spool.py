@@ -194,11 +194,6 @@ class Spool:
         with self._lock:
             return sum(past.dropped.size for past in self._past.values())
 
-    def used_bytes(self) -> int:
-        """Return the size of all segments."""
-        with self._lock:
-            return sum(segment.size for segment in self._segments)
-
     def close(self) -> None:
         """Sync, and unlock the folder. Nothing can be appended any more."""
         try:

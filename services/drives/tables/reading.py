@@ -67,7 +67,7 @@ def understand(sources: Sequence[Path], given: ImportMap, target: Target) -> Und
                 f"{after.source}: begins before {before.source} ends, runs of one truck must "
                 "follow one another: give each its start in [file.time] of a map (--map)"
             )
-    return Understood(runs, _once(guesses), _merged(maps))
+    return Understood(runs, list(dict.fromkeys(guesses)), _merged(maps))
 
 
 def _files(sources: Sequence[Path], given: ImportMap) -> list[Path]:
@@ -85,10 +85,6 @@ def _files(sources: Sequence[Path], given: ImportMap) -> list[Path]:
             f"{folder}: holds no table ({', '.join(_SUFFIXES)}), a drive as CSV files expected"
         )
     return used
-
-
-def _once(guesses: Sequence[Guess]) -> list[Guess]:
-    return list(dict.fromkeys(guesses))
 
 
 def _run_name(part: TablePart) -> str:
