@@ -107,10 +107,19 @@ def test_rejected_crossing_is_kept_and_adds_no_information(tmp_path: Path) -> No
     assert fusable_of(one) is None
 
 
-def test_names_that_are_no_names_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"bridge": "../elsewhere"}, r"identifier '\.\./elsewhere' must be"),
+        ({"entry_time": 1e18}, r"1e\+18 is no time of a crossing"),
+    ],
+)
+def test_name_or_time_that_is_none_is_refused_before_anything_is_written(
+    tmp_path: Path, changed: dict[str, object], words: str
+) -> None:
     some = crossings(2)
-    bad = some.crossings[1].model_copy(update={"bridge": "../elsewhere"})
-    with pytest.raises(InputError, match=r"identifier '\.\./elsewhere' must be"):
+    bad = some.crossings[1].model_copy(update=changed)
+    with pytest.raises(InputError, match=words):
         add_results(tmp_path, some.model_copy(update={"crossings": (some.crossings[0], bad)}))
     assert files(tmp_path) == []
 
@@ -410,14 +419,6 @@ def test_questions_leave_out_another_edition_too(
     line, _, row = capsys.readouterr().out.splitlines()
     assert "left out: is of edition 2 of driveby.history, this program knows 1" in line
     assert row.split()[:3] == ["sim-fleet", "bridge-1", "2"]
-
-
-def test_a_time_that_is_none_is_not_added(tmp_path: Path) -> None:
-    some = crossings(2)
-    bad = some.crossings[1].model_copy(update={"entry_time": 1e18})
-    with pytest.raises(InputError, match=r"1e\+18 is no time of a crossing"):
-        add_results(tmp_path, some.model_copy(update={"crossings": (some.crossings[0], bad)}))
-    assert files(tmp_path) == []
 
 
 def test_adding_again_without_temperatures_takes_none_away(tmp_path: Path) -> None:

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from schemas.errors import InputError
 from schemas.site import Vehicle
 from schemas.site_file import faults_of_site, load_site, parse_site, site_hash, site_toml
 from schemas.vehicle_info import differences, vehicle_part
 from services.identification.footprints import footprints_of, lead_of
+from tests.unit.schemas import test_site
 
 TEXT = (Path(__file__).parents[2] / "data" / "csv_example" / "site.toml").read_text()
 BEHIND = TEXT[TEXT.index("[bridge]") :]
@@ -44,11 +44,7 @@ def vehicle_of(*parts: str) -> Vehicle:
 
 
 def complaint(*parts: str) -> str:
-    with pytest.raises(InputError) as caught:
-        parse_site("".join(parts) + BEHIND, "site.toml")
-    line = str(caught.value)
-    assert "\n" not in line
-    return line.removeprefix("site.toml: ")
+    return test_site.complaint("".join(parts) + BEHIND)
 
 
 def test_two_axles_are_pairs() -> None:

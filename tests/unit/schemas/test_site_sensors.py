@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from schemas.errors import InputError
 from schemas.signals import CHANNELS
 from schemas.site import Site
 from schemas.site_file import parse_site, site_hash, site_toml
+from tests.unit.schemas.test_site import complaint
 
 TEXT = (Path(__file__).parents[2] / "data" / "csv_example" / "site.toml").read_text()
 BRIDGE = TEXT.index("[bridge]")
@@ -39,14 +39,6 @@ def text_of(
 
 def site_of(*body_and_axles: object) -> Site:
     return parse_site(text_of(*body_and_axles), "site.toml")  # type: ignore[arg-type]
-
-
-def complaint(text: str) -> str:
-    with pytest.raises(InputError) as caught:
-        parse_site(text, "site.toml")
-    line = str(caught.value)
-    assert "\n" not in line
-    return line.removeprefix("site.toml: ")
 
 
 def test_sensors_take_the_place_of_the_four() -> None:
