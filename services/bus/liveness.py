@@ -59,5 +59,5 @@ class LivenessProbe:
             if self._missed == _MISSES:
                 raise StaleConnectionError(
                     "the connection stands, but nothing comes through it: "
-                    f"{', '.join(sorted(self._there))} should be there, and nobody answers"
+                    f"{', '.join(sorted(self._there))} should be there, and there is no answer"
                 ) from None

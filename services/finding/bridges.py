@@ -233,7 +233,7 @@ class Bridges:
             self._warned.add(number)  # sea level and the ellipsoid are tens of metres apart
             _log.warning(
                 "%s: a truck drove along it, but %.0f m %s its start_altitude_m and "
-                "end_altitude_m: the bridge is taken for another road's",
+                "end_altitude_m: the truck is taken to be on another road",
                 *(self._bridges[number].id, abs(height_m), "above" if height_m > 0 else "below"),
             )
         return True

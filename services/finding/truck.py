@@ -86,7 +86,7 @@ class TruckBoot:
             self.ingest_info(self._declared_toml)
 
     def busy_at(self) -> set[str]:
-        """Return the bridges with a crossing that has begun and is not decided."""
+        """Return the bridges with a crossing that has started and is not decided."""
         return {bridge for (bridge, _), name in self.detected.items() if name not in self.done}
 
     def add_fix(self, bridges: Bridges, fix: GnssFix) -> list[int]:

@@ -1,4 +1,4 @@
-"""The logger's open recordings: one for each truck, begun, synced, closed and replaced.
+"""The logger's open recordings: one for each truck, created, synced, closed and replaced.
 
 A file is closed, with END and the reason, when it is old or large enough, on request, and when its
 truck has been quiet for long; the next message of that truck begins a new one.
@@ -94,7 +94,7 @@ class OpenFiles:
         return len(self._files)
 
     def write(self, message: Message, now_s: float) -> None:
-        """Write a message to its file, which is begun if needed; count it if it may have none."""
+        """Write a message to its file, which is created if needed; count it if it may have none."""
         name = file_of(self._place, message, self._files)
         opened = self._files.get(name)
         if opened is None:
@@ -255,7 +255,7 @@ class OpenFiles:
         """Begin a new file for one that was deleted, cut or moved, and write an event."""
         file = self._files.pop(name).file
         latched = self._latched.among(file.identities)
-        text = f"{file.path.name} was {what} by somebody else while it was being written"
+        text = f"{file.path.name} was {what} by another process while it was being written"
         number = 0
         if what == "moved":
             text += f"; it holds {file.messages} messages"

@@ -133,7 +133,7 @@ def recover_recording(
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # two at once would conflict
         except BlockingIOError:
             raise InputError(
-                f"{source}: is being written, or recovered by somebody else, at this moment"
+                f"{source}: is being written, or recovered by another process, at this moment"
             ) from None
         if not any(not isinstance(item, Damage) for item in _read(source, file)):
             raise InputError(f"{source}: holds nothing of an MCAP recording that can be read")

@@ -170,7 +170,7 @@ def _latest_state(
 def _state_of_all(
     name: str, state: BridgeResult | None, crossings: Sequence[CrossingResult]
 ) -> BridgeResult | None:
-    """Return a state of all good crossings of the newest one's realm, fused anew if one lacks."""
+    """Return a state of all good crossings of the newest one's realm, fused again if one lacks."""
     realm = crossings[-1].realm
     good = [c for c in crossings if c.realm == realm and c.verdict == "good"]
     fusable = {c.crossing_id for c in good if c.fusion_likelihood is not None}

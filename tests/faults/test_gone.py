@@ -83,7 +83,7 @@ def test_what_was_in_a_file_that_is_gone_is_not_called_durable(
     assert published.kind == EventKind.RECORDING_GONE
     ours = [p for p in folder.glob("live/*/*.mcap") if p.read_bytes()[:5] == b"\x89MCAP"]
     if harm is move:
-        assert f"{path.name} was moved by somebody else" in published.text
+        assert f"{path.name} was moved by another process" in published.text
         assert (found.count, found.sequence) == (150, 149)
         moved = tmp_path / "moved.mcap"
         assert (read_info(moved).end or {})["reason"] == "moved"
@@ -144,4 +144,4 @@ def test_a_deleted_recording_of_a_truck_that_has_gone_is_a_failure(
     assert one.logger is not None
     one.logger.terminate()
     assert one.logger.wait(timeout=LONGEST_S) == 1, one.logs()
-    assert "was deleted by somebody else while it was being written" in one.logs()
+    assert "was deleted by another process while it was being written" in one.logs()

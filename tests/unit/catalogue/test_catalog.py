@@ -193,7 +193,7 @@ def test_mending_names_what_is_gone_and_changed(fleet: Path, site: Site) -> None
     assert gone.endswith("a.mcap: is gone; its row is dropped")
     assert "b.mcap: has " in smaller
     assert damaged[0].endswith("is not the file of its row, but of the same size; "
-                               "its row is made anew")  # fmt: skip
+                               "its row is computed again")  # fmt: skip
     assert "c.mcap: damaged chunk" in damaged[1]
     assert read_catalog(folder).rows == mended.rows
 
@@ -340,9 +340,9 @@ def test_rows_that_hold_something_else_get_a_line_and_are_made_anew(
     file.write_bytes(encoded(pa.Table.from_pylist(outcome), catalog._KEY, catalog.EDITION))
     site = str(project / "docs/site.example.toml")
     assert cli.main(["catalog", str(fleet), "--site", site]) == 0
-    said = capsys.readouterr()
-    assert said.err == ""
-    assert sum(f"{file}: left out: " in line for line in said.out.splitlines()) == 1
+    output = capsys.readouterr()
+    assert output.err == ""
+    assert sum(f"{file}: left out: " in line for line in output.out.splitlines()) == 1
     assert read_catalog(folder).rows == truth
 
 
@@ -404,9 +404,9 @@ def test_the_command(
     table = tmp_path / "crossings.csv"
     site = str(project / "docs/site.example.toml")
     assert cli.main(["catalog", str(fleet), "--site", site, "--csv", str(table)]) == 0
-    said = capsys.readouterr().out
-    assert said.startswith("3 recordings (3 new to the catalogue), 1 truck, ")
-    assert "truck-1 over bridge-1" in said
+    output = capsys.readouterr().out
+    assert output.startswith("3 recordings (3 new to the catalogue), 1 truck, ")
+    assert "truck-1 over bridge-1" in output
     assert table.read_text().count("through") == 3
     assert cli.main(["catalog", str(tmp_path / "nowhere")]) == 2
     assert capsys.readouterr().err == f"driveby: {tmp_path / 'nowhere'}: no such folder\n"
@@ -423,9 +423,9 @@ def test_a_recording_without_measurements_does_not_begin_the_fleet(
     where = Key("live", "service", "logger", "health")
     record(fleet / "_service.mcap", iter([Message(where, health, 1, 1, later_ns, later_ns)]))
     assert cli.main(["catalog", str(fleet)]) == 0
-    said = capsys.readouterr().out
-    assert said.startswith("4 recordings (1 new to the catalogue)")
-    assert said.partition(" gap")[2].partition("\n")[0] == before
+    output = capsys.readouterr().out
+    assert output.startswith("4 recordings (1 new to the catalogue)")
+    assert output.partition(" gap")[2].partition("\n")[0] == before
     assert read_catalog(folder_at(str(fleet))).rows["_service.mcap"].first_ns == later_ns
 
 

@@ -24,7 +24,7 @@ from tests.object_store import object_store, read_only, use_keys
 QUICK = ("--method", "least-squares")
 
 
-def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str]:
+def output(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str]:
     code = cli.main([str(one) for one in arguments])
     return code, capsys.readouterr().err
 
@@ -57,7 +57,7 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, s
 def test_what_is_refused_is_one_line(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, options: list[str], line: str
 ) -> None:
-    code, err = said(capsys, "identify", EXACT, *options)
+    code, err = output(capsys, "identify", EXACT, *options)
     assert (code, err.count("\n")) == (2, 1)
     assert line in err
 
@@ -69,11 +69,11 @@ def test_credentials_must_be_those_of_a_client(
     certs_command(CertsSettings(folder=certs, cluster=True))
     for folder in (credentials / "truck-1", certs / "scheduler", tmp_path / "none"):
         where = ("--scheduler", "tls://127.0.0.1:8786", "--tls", folder)
-        code, err = said(capsys, "identify", EXACT, *where)
+        code, err = output(capsys, "identify", EXACT, *where)
         assert (code, err.count("\n")) == (2, 1)
         assert str(folder) in err
     where = ("--scheduler", "tcp://127.0.0.1:8786", "--tls", certs / "client")
-    assert "is an address without TLS" in said(capsys, "identify", EXACT, *where)[1]
+    assert "is an address without TLS" in output(capsys, "identify", EXACT, *where)[1]
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(
@@ -83,7 +83,7 @@ def test_a_scheduler_that_does_not_answer_is_one_line(
         taken.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
         where = ("--scheduler", address, "--reconnect-timeout", 1)
-        code, err = said(capsys, "identify", EXACT, *QUICK, *where)
+        code, err = output(capsys, "identify", EXACT, *QUICK, *where)
     assert (code, err.count("\n")) == (1, 1)
     assert f"{address}: no scheduler answers" in err
 
@@ -98,7 +98,7 @@ def test_missing_dask_names_the_install_command(
     )
     scheduler = ["--scheduler", "tcp://127.0.0.1:8786"]
     for arguments in (["cluster"], ["identify", EXACT, *QUICK, *scheduler]):
-        code, err = said(capsys, *arguments)
+        code, err = output(capsys, *arguments)
         assert (code, err.count("\n")) == (2, 1)
         assert install_command("cluster") in err
     assert cluster.BATCH == 50
@@ -107,15 +107,15 @@ def test_missing_dask_names_the_install_command(
 def test_a_cluster_listens_here_only_unless_it_has_certificates(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    code, err = said(capsys, "cluster", "--listen", "0.0.0.0")  # noqa: S104 - it is refused
+    code, err = output(capsys, "cluster", "--listen", "0.0.0.0")  # noqa: S104 - it is refused
     assert (code, err.count("\n")) == (2, 1)
     assert "without TLS anyone who reaches it runs programs" in err
-    code, err = said(capsys, "cluster", "--tls", tmp_path / "none")
+    code, err = output(capsys, "cluster", "--tls", tmp_path / "none")
     assert (code, err.count("\n")) == (2, 1)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        code, err = said(capsys, "cluster", "--port", taken.getsockname()[1])
+        code, err = output(capsys, "cluster", "--port", taken.getsockname()[1])
     assert (code, err.count("\n")) == (2, 1)
     assert "cannot listen at 127.0.0.1 port" in err
 
@@ -124,7 +124,7 @@ def test_a_folder_needs_a_place_for_its_results(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     drives(tmp_path / "recordings", 1)
-    code, err = said(capsys, "identify", tmp_path / "recordings", *QUICK)
+    code, err = output(capsys, "identify", tmp_path / "recordings", *QUICK)
     assert (code, err.count("\n")) == (2, 1)
     assert "--into" in err
 
@@ -143,7 +143,7 @@ def test_a_folder_is_identified_by_its_catalogue_and_gone_on_with(
     out = capsys.readouterr().out
     for path, line in (
         (third, "is gone"),
-        (second, "its row is made anew"),
+        (second, "its row is computed again"),
         (folder / "none.mcap", ""),
         (folder / CATALOG / "bad.parquet", "left out"),
     ):
@@ -162,7 +162,7 @@ def test_unwritable_output_is_refused_at_the_beginning(
 ) -> None:
     into = tmp_path / "into"
     (into / BRIDGES).mkdir(parents=True)
-    code, err = said(capsys, "identify", EXACT, *QUICK, "--into", into)
+    code, err = output(capsys, "identify", EXACT, *QUICK, "--into", into)
     assert (code, err.count("\n")) == (2, 1)
     assert f"{into / BRIDGES}: is a folder" in err
     assert [path.name for path in into.iterdir()] == [BRIDGES]
@@ -176,8 +176,8 @@ def test_recordings_in_an_object_store_give_what_they_give_here(
     paths = drives(tmp_path / "recordings", 3)
     found = [tmp_path / f"{n}.json" for n in range(4)]
     here = ("identify", *paths, *QUICK, "--into", tmp_path / "here", "--json", found[0])
-    assert said(capsys, *here) == (0, "")
-    assert said(capsys, "identify", paths[0], *QUICK, "--json", found[1]) == (0, "")
+    assert output(capsys, *here) == (0, "")
+    assert output(capsys, "identify", paths[0], *QUICK, "--json", found[1]) == (0, "")
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
@@ -186,19 +186,19 @@ def test_recordings_in_an_object_store_give_what_they_give_here(
         for path in paths:
             put(folder_at(fleet), f"day/{path.name}", path.read_bytes())
         there = ("identify", fleet, *QUICK, "--into", tmp_path / "there", "--json", found[2])
-        assert said(capsys, *there) == (0, "")
+        assert output(capsys, *there) == (0, "")
         one = f"{fleet}/day/{paths[0].name}"
-        assert said(capsys, "identify", one, *QUICK, "--json", found[3]) == (0, "")
+        assert output(capsys, "identify", one, *QUICK, "--json", found[3]) == (0, "")
         gone = f"{fleet}/day/gone.mcap"
-        assert said(capsys, "identify", gone, *QUICK) == (2, f"driveby: {gone}: no such file\n")
+        assert output(capsys, "identify", gone, *QUICK) == (2, f"driveby: {gone}: no such file\n")
         put(folder_at(fleet), "bad.mcap", b"no recording at all")
         bad = f"{fleet}/bad.mcap"
-        code, err = said(capsys, "identify", bad, *QUICK)
+        code, err = output(capsys, "identify", bad, *QUICK)
         assert (code, err) == (
             2,
             f"driveby: {bad}: is not an MCAP file; a recording (.mcap) is expected\n",
         )
-        assert said(capsys, "identify", fleet, *QUICK) == (
+        assert output(capsys, "identify", fleet, *QUICK) == (
             2,
             f"driveby: {fleet}: is a folder; give recordings, or --into DIR for its results\n",
         )
@@ -221,19 +221,19 @@ def test_bucket_that_may_only_be_read_is_identified(
     paths = drives(tmp_path / "recordings", 2)
     found = [tmp_path / f"{n}.json" for n in range(3)]
     here = ("identify", *paths, *QUICK, "--into", tmp_path / "here", "--json", found[0])
-    assert said(capsys, *here) == (0, "")
+    assert output(capsys, *here) == (0, "")
     with object_store(monkeypatch) as address:
         fleet = f"{address}/fleet"
         for path in paths:
             put(folder_at(fleet), f"day/{path.name}", path.read_bytes())
         with read_only(monkeypatch):
             there = ("identify", fleet, *QUICK, "--into", tmp_path / "there", "--json", found[1])
-            code, err = said(capsys, *there)
+            code, err = output(capsys, *there)
             assert (code, err.count("\n")) == (0, 1), err
             assert f"{fleet}: cannot write its catalogue" in err
             single = f"{fleet}/day/{paths[0].name}"
-            assert said(capsys, "identify", single, *QUICK, "--json", found[2]) == (0, "")
-            code, err = said(capsys, "catalog", fleet)  # whose work is to write it
+            assert output(capsys, "identify", single, *QUICK, "--json", found[2]) == (0, "")
+            code, err = output(capsys, "catalog", fleet)  # whose work is to write it
             assert (code, err.count("\n")) == (1, 1)
             assert "could not be written: Access Denied" in err
             names = [entry.name for entry in files_below(folder_at(fleet), "")]
@@ -257,7 +257,7 @@ def test_wrong_keys_of_a_store_are_one_line(
                 use_keys(monkeypatch, key_id, "not the secret")
                 for source in (fleet, f"{fleet}/{path.name}"):
                     for options in ((), ("--into", tmp_path / "into")):
-                        code, err = said(capsys, "identify", source, *QUICK, *options)
+                        code, err = output(capsys, "identify", source, *QUICK, *options)
                         assert (code, err.count("\n")) == (2, 1), err
                         assert err.startswith(f"driveby: {source}: cannot be read: "), err
                         assert why in err
