@@ -59,16 +59,16 @@ def drives(folder: Path, crossings: int, each: int = 1, source: Path = EXACT) ->
 def _later(once: list[tuple[Message, AnySignal]], number: int) -> Iterator[Message]:
     """The messages of a drive `number` times ten minutes later, as of another boot."""
     by = number * APART_NS
-    for message, said in once:
+    for message, output in once:
         boot_id = message.boot_id + number
-        times: dict[str, Any] = {"boot_id": boot_id, "wall_time_ns": said.wall_time_ns + by}
-        match said:
+        times: dict[str, Any] = {"boot_id": boot_id, "wall_time_ns": output.wall_time_ns + by}
+        match output:
             case AccelBatch():
-                payload = encode_accel(said._replace(**times))
+                payload = encode_accel(output._replace(**times))
             case GnssFix():
-                payload = encode_gnss(said._replace(**times))
+                payload = encode_gnss(output._replace(**times))
             case VehicleInfo():
-                payload = encode_info(said._replace(**times))
+                payload = encode_info(output._replace(**times))
         yield message._replace(
             payload=payload,
             boot_id=boot_id,

@@ -138,7 +138,7 @@ def lowest(pip: list[str | Path]) -> Iterator[str]:
     """
     wheels = [*pip, "install", "--dry-run", "--quiet", "--only-binary", ":all:"]
     for package, bound in bounds_of_project():
-        listed = said([*pip, "index", "versions", package])
+        listed = output([*pip, "index", "versions", package])
         found = re.search(r"^Available versions: (.*)$", listed, re.MULTILINE)
         versions = sorted(found[1].split(", ") if found else [], key=numbers_of)
         allowed = [one for one in versions if numbers_of(one) >= numbers_of(bound)]
@@ -146,7 +146,7 @@ def lowest(pip: list[str | Path]) -> Iterator[str]:
         yield next((pin for pin in pins if succeeds([*wheels, pin])), f"{package}=={bound}")
 
 
-def said(command: list[str | Path]) -> str:
+def output(command: list[str | Path]) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout
 
 
@@ -206,8 +206,8 @@ def tried(one: Environment, wheel: Path, folder: Path, matching: str, is_there: 
         command += ["-W", "default::DeprecationWarning"] if one.is_lowest else []
         code, _ = run(*command, *(["-k", matching] if matching else []), cwd=checkout)
     last = (folder / "log.txt").read_text().strip().splitlines()[-1].strip("= ")
-    said = f"{'runs' if demo == 0 else f'exit code {demo}'} ({demo_s:.0f} s)"
-    return Outcome(one, version, said, last, code == 0 and demo == 0)
+    output = f"{'runs' if demo == 0 else f'exit code {demo}'} ({demo_s:.0f} s)"
+    return Outcome(one, version, output, last, code == 0 and demo == 0)
 
 
 def left_out(name: str) -> str:

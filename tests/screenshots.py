@@ -168,8 +168,8 @@ def take(shot: Shot, folder: Path, size: str = "1400x850") -> bytes:
         else:
             viewer.set_time(play_state="paused")
         taken = picture(viewer)
-        said = complaints(viewer)
-        assert not said, said
+        output = complaints(viewer)
+        assert not output, output
         return taken
 
 
@@ -214,8 +214,8 @@ def take_live(folder: Path, size: str = "1400x850") -> dict[str, bytes]:
                 driving = viewer.take_screenshot()
                 shows(viewer, GOOD, 1500)
                 answered = viewer.take_screenshot()
-                said = complaints(viewer)
-                assert not said, said
+                output = complaints(viewer)
+                assert not output, output
     return {"view-live": driving, "view-live-result": answered}
 
 
@@ -241,8 +241,8 @@ def running(folder: Path, *arguments: str) -> Iterator[Path]:
     log = folder / f"{arguments[0]}.log"
     command = [sys.executable, "-m", "driveby", *arguments]
     own = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    with log.open("wb") as said:
-        process = subprocess.Popen(command, stdout=said, stderr=said, env=own)
+    with log.open("wb") as output:
+        process = subprocess.Popen(command, stdout=output, stderr=output, env=own)
     try:
         yield log
     finally:

@@ -31,8 +31,8 @@ class WorkingEngine:
         self._execution = execution or unhurried()
         self._header = header
 
-    def resume(self, said: Iterable[tuple[Key, bytes]]) -> Iterator[Output]:
-        known = known_crossings(said, search_hash(self._header))
+    def resume(self, output: Iterable[tuple[Key, bytes]]) -> Iterator[Output]:
+        known = known_crossings(output, search_hash(self._header))
         return dispatch(self.inner, self._execution, self.inner.resume(known))
 
     def expect(self, key: Key, payload: bytes, *, for_ever: bool = False) -> None:
@@ -42,8 +42,8 @@ class WorkingEngine:
         return dispatch(self.inner, self._execution, self.inner.feed(key, payload))
 
     def gone(self, realm: str, vehicle: str, *, for_good: bool = False) -> Iterator[Output]:
-        said = self.inner.gone(realm, vehicle, for_good=for_good)
-        return dispatch(self.inner, self._execution, said)
+        output = self.inner.gone(realm, vehicle, for_good=for_good)
+        return dispatch(self.inner, self._execution, output)
 
     def finish(self) -> Iterator[Output]:
         return dispatch(self.inner, self._execution, self.inner.finish())

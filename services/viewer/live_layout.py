@@ -96,7 +96,7 @@ def _truck(vehicle: str, channels: Set[str]) -> rrb.Container:
 
 
 def _bridge(bridge: str) -> rrb.Container:
-    wording = rrb.TextDocumentView(origin=f"said/{_part(bridge)}", name="Newest result")
+    wording = rrb.TextDocumentView(origin=f"newest/{_part(bridge)}", name="Newest result")
     strip = flat_view(
         f"{result_root(bridge)}/strip",
         "EI / nominal along the span, 95 % interval; road",

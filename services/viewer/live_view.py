@@ -292,7 +292,7 @@ class LiveView:
         texts = (self._drawn.get(bridge, (0.0, ""))[1], self._findings.get(bridge, ""))
         text = bridge_text(self._alarms.get(bridge), *texts)
         document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
-        TimestampedStream(self._recording, moment_ns).log(f"said/{bridge}", document)
+        TimestampedStream(self._recording, moment_ns).log(f"newest/{bridge}", document)
 
     def _draw_bridge(
         self, bridge: BridgeOnMap, ratios: FloatArray | None, moment_ns: int, doubtful: bool

@@ -59,12 +59,12 @@ def sample() -> _Sample:
     drives = index_messages("sample", messages_of_trucks([SAMPLE]), site)
     for fix in drives.near:
         engine.expect(fix.key, fix.payload, for_ever=True)
-    said = [
+    output = [
         one
         for message in in_measurement_order(drives)
         for one in engine.feed(message.key, message.payload)
     ]
-    (work,) = (one for one in [*said, *engine.finish()] if isinstance(one, IdentificationTask))
+    (work,) = (one for one in [*output, *engine.finish()] if isinstance(one, IdentificationTask))
     here = InlineExecutor()
     here.submit(work)
     (finished,) = here.collect()

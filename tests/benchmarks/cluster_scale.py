@@ -84,7 +84,7 @@ class Taken(NamedTuple):
     clock_s: float
     processor_s: float
 
-    def said(self, who: str) -> "Taken":
+    def output(self, who: str) -> "Taken":
         print(
             f"{who}: {60.0 / self.clock_s:.1f} crossings a minute, "
             f"{self.processor_s:.2f} s of processor time each",
@@ -106,7 +106,7 @@ def in_one_process(recordings: list[Path], into: Path) -> Taken:
     identify_archive(asked, Timed(), ResultStore(into))
     number = len(times) - 1
     (began_s, began), (ended_s, ended) = times[0], times[-1]
-    return Taken((ended_s - began_s) / number, (ended - began) / number).said("one process")
+    return Taken((ended_s - began_s) / number, (ended - began) / number).output("one process")
 
 
 def on_cluster(two: RunningCluster, recordings: list[Path], into: Path, batch: int) -> Taken:
@@ -117,7 +117,7 @@ def on_cluster(two: RunningCluster, recordings: list[Path], into: Path, batch: i
     finish(identification(two, recordings, into, batch))
     number = len(contents(into))
     taken = Taken((time.monotonic() - began_s) / number, (processor_s(two) - began) / number)
-    return taken.said(f"{WORKERS} workers")
+    return taken.output(f"{WORKERS} workers")
 
 
 def processor_s(two: RunningCluster) -> float:
@@ -158,7 +158,7 @@ def wait_for(into: Path, crossings: int, running: Running) -> None:
     """Until so many are done, however long that takes; the command must still be under way."""
     while len(contents(into)) < crossings and running.process.poll() is None:
         time.sleep(1.0)
-    assert running.process.poll() is None, running.said()
+    assert running.process.poll() is None, running.output()
 
 
 def identification(two: RunningCluster, recordings: list[Path], into: Path, batch: int) -> Running:
@@ -173,7 +173,7 @@ def identification(two: RunningCluster, recordings: list[Path], into: Path, batc
 def finish(running: Running) -> None:
     while running.process.poll() is None:
         time.sleep(0.1)
-    assert running.process.returncode == 0, running.said()
+    assert running.process.returncode == 0, running.output()
 
 
 def results(into: Path) -> dict[str, str]:

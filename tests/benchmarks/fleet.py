@@ -66,7 +66,7 @@ def main() -> None:
     shutil.rmtree(history / "fused", ignore_errors=True)
     command = [sys.executable, "-m", "services", "history", bridge, "--history", str(history)]
     for what in ("first", "again"):
-        took(f"driveby history {bridge}, {what}", lambda: said(command))
+        took(f"driveby history {bridge}, {what}", lambda: output(command))
     now_s = BEGIN_S + YEARS * 365.25 * 86_400.0
     settings = AlarmSettings()
     with one_blas_thread():
@@ -142,7 +142,7 @@ def catalogue_bytes() -> float:
     return len(_file_of(rows)) / len(rows)
 
 
-def said(command: list[str]) -> str:
+def output(command: list[str]) -> str:
     out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     return out.splitlines()[0]
 

@@ -40,14 +40,14 @@ def encoded(
 
 
 def assert_same(payload: bytes) -> None:
-    def said_by(check: Callable[[bytes], object]) -> object:
+    def output_of(check: Callable[[bytes], object]) -> object:
         try:
             return check(payload)
         except ValueError as error:
             return str(error)
 
-    expected = said_by(lambda payload: signals.stamp(signals.decode_accel(payload)))
-    assert said_by(check_accel) == expected
+    expected = output_of(lambda payload: signals.stamp(signals.decode_accel(payload)))
+    assert output_of(check_accel) == expected
 
 
 BATCH = encoded(*[(position, 1000.0, [0.5] * 50) for position in (1, 2, 3, 4)])

@@ -93,15 +93,15 @@ def test_checks_ask_the_service_itself_in_its_own_realm(name: str) -> None:
     assert check[:3] == ["CMD", "driveby", "health"]
     options = cli._parser().parse_args(check[2:])
     assert options.service == name
-    said = cli._parser().parse_args(SERVICES[name]["command"])
-    assert said.realm in (options.realm, [options.realm])  # a logger may have several
-    assert options.tls == said.tls
+    output = cli._parser().parse_args(SERVICES[name]["command"])
+    assert output.realm in (options.realm, [options.realm])  # a logger may have several
+    assert options.tls == output.tls
 
 
 def test_what_the_truck_says_is_recorded_and_identified() -> None:
-    said = {n: cli._parser().parse_args(SERVICES[n]["command"]) for n in ("truck", "worker")}
+    output = {n: cli._parser().parse_args(SERVICES[n]["command"]) for n in ("truck", "worker")}
     logger = cli._parser().parse_args(SERVICES["logger"]["command"])
-    assert logger.realm == [said["truck"].realm] == [said["worker"].realm]
+    assert logger.realm == [output["truck"].realm] == [output["worker"].realm]
 
 
 def test_it_comes_up_a_second_time() -> None:
@@ -252,7 +252,7 @@ def checked(path: Path) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize(
-    ("engine", "compose", "said"),
+    ("engine", "compose", "output"),
     [
         ("26.0.0", "2.26.0", ""),
         ("27.3.1+1", "v2.30.3-desktop.1", ""),
@@ -264,12 +264,12 @@ def checked(path: Path) -> tuple[int, str]:
     ],
 )
 def test_too_old_version_gives_one_line(
-    tmp_path: Path, engine: str, compose: str, said: str
+    tmp_path: Path, engine: str, compose: str, output: str
 ) -> None:
     code, line = checked(a_docker(tmp_path, engine, compose))
-    assert code == (1 if said else 0)
-    assert line.endswith(said)
-    assert line.count("\n") == bool(said)
+    assert code == (1 if output else 0)
+    assert line.endswith(output)
+    assert line.count("\n") == bool(output)
 
 
 def test_an_engine_that_does_not_run_or_is_not_there_is_one_line(tmp_path: Path) -> None:

@@ -75,13 +75,13 @@ def test_the_example_decodes_an_estimate(tmp_path: Path) -> None:
     now = 1_790_000_000_000_000_000
     message = Message(key, payload.SerializeToString(), 1, 0, now, now)
     write_recording(tmp_path / "r.mcap", [message], site_toml=None, reason="test")
-    said = subprocess.run(
+    output = subprocess.run(
         [sys.executable, ROOT / "docs/examples/decode_estimate.py", tmp_path / "r.mcap"],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         check=True,
     ).stdout
-    assert said.startswith("a GOOD\n")
-    assert "  EI_4 6.24e+09 (5.884e+09 to 6.614e+09) N·m²\n" in said
-    assert said.count("\n") == 8
+    assert output.startswith("a GOOD\n")
+    assert "  EI_4 6.24e+09 (5.884e+09 to 6.614e+09) N·m²\n" in output
+    assert output.count("\n") == 8

@@ -27,7 +27,7 @@ class Running(NamedTuple):
     process: subprocess.Popen[str]
     log: Path
 
-    def said(self) -> str:
+    def output(self) -> str:
         return self.log.read_text()
 
     def wait(self) -> int:
@@ -40,7 +40,7 @@ class RunningCluster(NamedTuple):
 
     def pids(self, name: str) -> list[int]:
         """Of a process by its name, the newest last."""
-        return [int(n) for n in re.findall(rf"{name} is process (\d+)", self.command.said())]
+        return [int(n) for n in re.findall(rf"{name} is process (\d+)", self.command.output())]
 
 
 def start(log: Path, *arguments: str, env: dict[str, str] | None = None) -> Running:
@@ -73,14 +73,14 @@ def cluster(
         env=env,
     )
     try:
-        until(lambda: "ready: " in running.said() or running.process.poll() is not None)
-        assert running.process.poll() is None, running.said()
+        until(lambda: "ready: " in running.output() or running.process.poll() is not None)
+        assert running.process.poll() is None, running.output()
         yield RunningCluster(f"{scheme}://127.0.0.1:{port}", running)
-        assert running.process.poll() is None, running.said()
+        assert running.process.poll() is None, running.output()
     finally:
         running.process.send_signal(signal.SIGTERM)
         code = running.wait()
-    assert code == 0, running.said()
+    assert code == 0, running.output()
 
 
 def contents(into: Path) -> list[str]:

@@ -32,7 +32,7 @@ class Truck:
     ) -> None:
         self._fleet = fleet
         self.vehicle = vehicle
-        self.said: dict[int, int] = {}
+        self.output: dict[int, int] = {}
         """By boot_id the last sequence of accel."""
         self.last_line = ""
         self.is_driving = True
@@ -56,12 +56,12 @@ class Truck:
             self.last_line = line.strip()
             boot_id, _, sequence = self.last_line.partition(" ")
             if boot_id.isdigit() and line.endswith("\n"):
-                self.said[int(boot_id)] = int(sequence)
+                self.output[int(boot_id)] = int(sequence)
 
     def wait_for(self, batches: int, timeout_s: float = LONGEST_S) -> None:
         deadline = time.monotonic() + timeout_s
-        while max(self.said.values(), default=0) < batches:
-            assert time.monotonic() < deadline, f"{self.vehicle}: only {self.said}"
+        while max(self.output.values(), default=0) < batches:
+            assert time.monotonic() < deadline, f"{self.vehicle}: only {self.output}"
             time.sleep(0.02)
 
     def kill(self) -> None:
@@ -153,7 +153,7 @@ class Fleet:
         self.logger.send_signal(signal.SIGTERM)
         assert self.logger.wait(timeout=LONGEST_S) == 0, self.logs()
 
-    def said_by_logger(self) -> str:
+    def logger_output(self) -> str:
         return "".join(
             path.read_text() for path in sorted(self.folder.glob("logger_process-*.log"))
         )
@@ -197,7 +197,7 @@ class Fleet:
         """Everything that any truck handed over is there; return how often in two files."""
         union, twice = self.recorded()
         for truck in self.trucks:
-            for boot_id, last in truck.said.items():
+            for boot_id, last in truck.output.items():
                 for stream, highest in (("accel", last), ("gnss", last // 2), ("info", 0)):
                     found = union.get((truck.vehicle, stream, boot_id), set())
                     missing = set(range(highest + 1)) - found

@@ -337,7 +337,7 @@ class View(NamedTuple):
             for bridge in known.bridges
             for vehicle in known.vehicles
         }
-        pages = {f"/said/{bridge.id}": bridge.id for bridge in known.bridges}
+        pages = {f"/newest/{bridge.id}": bridge.id for bridge in known.bridges}
         found = Picture(set(), Counter())
         with warnings.catch_warnings(), contextlib.suppress(RuntimeError, ValueError):
             # The file is still being written: it has no footer.
@@ -452,7 +452,7 @@ def live(
     moments = random.Random(seed)
     # The results are looked at while they are written.
     log = logging.getLogger(read_messages.__module__)
-    said_before = log.level
+    earlier_output = log.level
     log.setLevel(logging.ERROR)
     fleet = Fleet(folder, method=method, processes=processes)
     began = time.monotonic()
@@ -504,7 +504,7 @@ def live(
         results = fleet.results()
     finally:
         fleet.close()
-        log.setLevel(said_before)
+        log.setLevel(earlier_output)
     problems = problems_of(plans, results) + problems_of_view(picture, plans)
     if problems:
         problems.append(fleet.logs())

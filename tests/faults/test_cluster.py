@@ -155,7 +155,7 @@ def begin(tmp_path: Path) -> Iterator[Callable[..., Running]]:
 def in_the_middle(running: Running, into: Path) -> None:
     """Wait until some crossings are kept; others are held."""
     until(lambda: contents(into) or running.process.poll() is not None)
-    assert running.process.poll() is None, running.said()
+    assert running.process.poll() is None, running.output()
     assert 0 < len(contents(into)) < CROSSINGS
 
 
@@ -207,13 +207,13 @@ def test_killed_process_loses_no_result(
     before = two.pids(whom)
     os.kill(before[-1], by)
     until(lambda: len(two.pids(whom)) > len(before))
-    assert f"the {whom} ended ({cause}); restarting it" in two.command.said()
+    assert f"the {whom} ended ({cause}); restarting it" in two.command.output()
     held.file.unlink()
-    assert running.wait() == 0, running.said()
+    assert running.wait() == 0, running.output()
     assert results_of(path) == of_one_process
     assert len(contents(into)) == len(set(contents(into))) == CROSSINGS
-    is_reported = "scheduler tcp://" in running.said()
-    assert is_reported == (whom == "scheduler"), running.said()
+    is_reported = "scheduler tcp://" in running.output()
+    assert is_reported == (whom == "scheduler"), running.output()
 
 
 @pytest.mark.faults
@@ -232,9 +232,9 @@ def test_idle_scheduler_lives_on_whatever_dask_is_configured_to(
                 client.sync(client.scheduler.terminate)  # as Client.shutdown does
             until(lambda: client.run_on_scheduler(idle_s) > 2.0)
         running = begin(*of(recordings[:1], *on(two, tmp_path / "into")))
-        assert running.wait() == 0, running.said()
-        assert " lost; waiting" not in running.said()
-        assert "ended (" not in two.command.said()
+        assert running.wait() == 0, running.output()
+        assert " lost; waiting" not in running.output()
+        assert "ended (" not in two.command.output()
         assert len(two.pids("scheduler")) == 1
 
 
@@ -264,8 +264,8 @@ def test_a_client_that_is_killed_goes_on(
     assert 0 < there < CROSSINGS
     second = begin(*of(recordings, *on(two, into, "--json", str(path))))
     held.file.unlink()
-    assert second.wait() == 0, second.said()
-    assert f"{CROSSINGS} crossings, {there} from earlier runs" in second.said()
+    assert second.wait() == 0, second.output()
+    assert f"{CROSSINGS} crossings, {there} from earlier runs" in second.output()
     assert results_of(path) == of_one_process
     assert len(contents(into)) == len(set(contents(into))) == CROSSINGS
 
@@ -287,7 +287,7 @@ def test_two_clients_with_one_folder_do_each_other_no_harm(
     for running in both:
         in_the_middle(running, into)
     held.file.unlink()
-    assert [running.wait() for running in both] == [0, 0], [one.said() for one in both]
+    assert [running.wait() for running in both] == [0, 0], [one.output() for one in both]
     assert [results_of(path) for path in paths] == [of_one_process] * 2
     assert len(set(contents(into))) == CROSSINGS
     problems: list[str] = []
@@ -327,11 +327,11 @@ def test_a_worker_of_another_version_that_comes_later_is_sent_away(
     in_the_middle(running, into)
     with other_worker(two.address, tmp_path, preload) as address:
         refused = f"worker {address}: has driveby 0.0.9"
-        until(lambda: refused in running.said() or running.process.poll() is not None)
+        until(lambda: refused in running.output() or running.process.poll() is not None)
         held.file.unlink()
-        assert running.wait() == 0, running.said()
-    assert refused in running.said()
-    assert "retiring it" in running.said()
+        assert running.wait() == 0, running.output()
+    assert refused in running.output()
+    assert "retiring it" in running.output()
     assert results_of(path) == of_one_process
 
 
@@ -370,8 +370,8 @@ def test_a_crossing_that_ends_every_worker_costs_itself_only(
     with cluster(tmp_path, env={"DASK_DISTRIBUTED__WORKER__PRELOAD": f"['{preload}']"}) as running:
         options = on(running, into, "--json", str(path))
         first = begin(*of(recordings[:2], *options))
-        assert first.wait() == 3, first.said()
-    (name,) = re.findall(r"(\S+): its identification failed", first.said())
+        assert first.wait() == 3, first.output()
+    (name,) = re.findall(r"(\S+): its identification failed", first.output())
     assert "T002003" in name
     found = results_of(path)["crossings"]
     failed = [one for one in found if one["reasons"] == ["failed"]]
@@ -397,10 +397,10 @@ def checked(
         in_the_middle(running, into)
         do(running)
         held.file.unlink(missing_ok=True)
-        assert running.wait() == 0, running.said()
+        assert running.wait() == 0, running.output()
         assert results_of(path) == of_one_process
         assert len(contents(into)) == len(set(contents(into))) == CROSSINGS
-        return running.said()
+        return running.output()
 
     return one
 
@@ -416,10 +416,10 @@ def test_permanently_frozen_process_is_ended_without_loss(
             before = one.cluster.pids(whom)
             os.kill(before[-1], signal.SIGSTOP)
             until(lambda: len(one.cluster.pids(whom)) > len(before))
-            assert f"the {whom} has done nothing for 5 s; ending it" in one.cluster.command.said()
+            assert f"the {whom} has done nothing for 5 s; ending it" in one.cluster.command.output()
 
-        said = checked(one, freeze, DRIVEBY_TEST_CALL_S="2")
-    assert ("scheduler tcp://" in said) == (whom == "scheduler"), said
+        output = checked(one, freeze, DRIVEBY_TEST_CALL_S="2")
+    assert ("scheduler tcp://" in output) == (whom == "scheduler"), output
 
 
 @pytest.mark.faults
@@ -437,8 +437,8 @@ def test_a_worker_that_is_frozen_and_goes_on_leaves_what_was_its_own_to_others(
             one.file.unlink()  # it ends when its batch has
             until(lambda: len(one.cluster.pids("worker 1")) > len(before))
 
-        said = checked(one, freeze)
-    assert "scheduler tcp://" not in said, said
+        output = checked(one, freeze)
+    assert "scheduler tcp://" not in output, output
 
 
 @pytest.mark.faults
@@ -456,10 +456,10 @@ def test_client_retries_while_a_worker_is_frozen(
         options = on(one.cluster, into, "--json", str(path))
         running = begin(*of(recordings, *options), DRIVEBY_TEST_CALL_S="2")
         published = "could not ask for its workers' versions"
-        until(lambda: published in running.said() or running.process.poll() is not None)
+        until(lambda: published in running.output() or running.process.poll() is not None)
         os.kill(worker, signal.SIGCONT)
-        assert running.wait() == 0, running.said()
-    assert published in running.said()
+        assert running.wait() == 0, running.output()
+    assert published in running.output()
     assert results_of(path) == of_one_process
 
 
@@ -474,7 +474,7 @@ def test_a_scheduler_that_is_frozen_and_goes_on_costs_nothing(
         def freeze(running: Running) -> None:
             (scheduler,) = one.cluster.pids("scheduler")
             os.kill(scheduler, signal.SIGSTOP)
-            until(lambda: "scheduler tcp://" in running.said())
+            until(lambda: "scheduler tcp://" in running.output())
             os.kill(scheduler, signal.SIGCONT)
 
         checked(one, freeze, DRIVEBY_TEST_CALL_S="6")
@@ -495,16 +495,16 @@ def test_a_scheduler_that_is_frozen_for_ever_and_nobody_ends_is_a_line(
         in_the_middle(first, into)
         (scheduler,) = one.cluster.pids("scheduler")
         os.kill(scheduler, signal.SIGSTOP)
-        assert first.wait() == 1, first.said()
+        assert first.wait() == 1, first.output()
         assert re.search(
-            r"^driveby: .*: no scheduler answers \(.*\); start one", first.said(), re.M
+            r"^driveby: .*: no scheduler answers \(.*\); start one", first.output(), re.M
         )
-        assert "Traceback" not in first.said()
+        assert "Traceback" not in first.output()
         assert 0 < len(contents(into)) < CROSSINGS
         os.kill(scheduler, signal.SIGCONT)
         one.file.unlink()
         second = begin(*of(recordings, *options))
-        assert second.wait() == 0, second.said()
+        assert second.wait() == 0, second.output()
     assert results_of(path) == of_one_process
     assert len(contents(into)) == len(set(contents(into))) == CROSSINGS
 
@@ -522,7 +522,7 @@ def test_frozen_processes_below_workers_are_ended_and_cost_nothing(
             for pid in frozen:
                 os.kill(pid, signal.SIGSTOP)
 
-        said = checked(one, freeze)
+        output = checked(one, freeze)
         assert frozen != []
         assert not [pid for pid in frozen if Path(f"/proc/{pid}").exists()]
-    assert "scheduler tcp://" not in said, said
+    assert "scheduler tcp://" not in output, output

@@ -296,7 +296,7 @@ def test_a_failing_fsync_ends_the_recording_and_claims_nothing(
         DISK.sync(descriptor)
 
     def durable_streams() -> list[pb.DurableStream]:
-        return [stream for said in writer.durable()[1].values() for stream in said.streams]
+        return [stream for output in writer.durable()[1].values() for stream in output.streams]
 
     writer = FileWriter(place(tmp_path), disk=DISK._replace(sync=sync))
     sent = send_until_it_fails(writer, 1)

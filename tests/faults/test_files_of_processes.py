@@ -83,11 +83,11 @@ def test_results_of_a_worker_that_outlives_the_logger_are_there_once(
 
 def on_disk(session: zenoh.Session) -> int:
     """How many crossings the logger says are on its disk."""
-    said = [
+    output = [
         pb.Durable.FromString(p)
         for p in get_latest(session, selector("live", "service", "durable"))
     ]
-    return sum(one.count for found in said for one in found.streams if one.stream == "crossing")
+    return sum(one.count for found in output for one in found.streams if one.stream == "crossing")
 
 
 def holds_something(path: Path) -> bool:

@@ -164,7 +164,7 @@ def test_frozen_for_longer_than_its_time_outs(fleet: MakeFleet, what: str, secon
     healthy.wait_for(20)
     process = {"truck": frozen.process, "logger": one.logger, "router": one.router}[what]
     process.send_signal(signal.SIGSTOP)
-    before = max(healthy.said.values())
+    before = max(healthy.output.values())
     time.sleep(seconds)
     # The caller of a gateway is never held up by the network: it would say nothing any more.
     healthy.wait_for(before + round(10 * seconds))
@@ -183,7 +183,7 @@ def test_a_frozen_truck_delays_no_other(fleet: MakeFleet, router: bool) -> None:
         frozen, healthy = one.start_truck("truck-1"), one.start_truck("truck-2")
         frozen.wait_for(20)
         frozen.process.send_signal(signal.SIGSTOP)
-        healthy.wait_for(max(healthy.said.values(), default=0) + 60)
+        healthy.wait_for(max(healthy.output.values(), default=0) + 60)
         late = one.start_truck("truck-3")
         late.wait_for(40)
         frozen.process.send_signal(signal.SIGCONT)
@@ -233,7 +233,7 @@ def test_a_frozen_subscriber_holds_up_the_logger_for_seconds_only(fleet: MakeFle
     viewer.send_signal(signal.SIGSTOP)
     with hesitation() as own_delay_s:
         for truck in trucks:
-            truck.wait_for(max(truck.said.values()) + 12_000)
+            truck.wait_for(max(truck.output.values()) + 12_000)
         assert one.finish() == 0
         machine_s = _SWITCHES * own_delay_s()
     assert max(lags_s(one)) < max(5.0, machine_s)  # Zenoh's own patience made it 10

@@ -87,8 +87,8 @@ def test_a_truck_in_300_realms_costs_another_one_nothing(fleet: Callable[..., An
     assert twice == 0
     for (vehicle, _, _), found in numbers.items():
         assert found == set(range(len(found))), vehicle
-    [boot_id] = truck.said
-    assert len(numbers[("truck-1", "accel", boot_id)]) == truck.said[boot_id] + 1
+    [boot_id] = truck.output
+    assert len(numbers[("truck-1", "accel", boot_id)]) == truck.output[boot_id] + 1
     events = [
         decode_event(message.payload)
         for path in (one.folder / "recordings").glob("*/*/*.mcap")

@@ -424,7 +424,7 @@ def test_a_router_between_trucks_and_logger_filters_both(credentials: Path, endp
         settle(truck)
         logger.put(f"{V1}/live/service/worker/durable", b"impostor")
         logger.put(f"{V1}/live/service/logger/durable", b"safe")
-        until(lambda: heard, "what the logger said")
+        until(lambda: heard, "a message of the logger")
         assert [payload for _, payload in heard] == [b"safe"]
         sensors.close()
         announcements.close()

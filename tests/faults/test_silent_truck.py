@@ -46,12 +46,12 @@ def check_silence(
     healthy = one.start_truck("truck-2", rate=rate, endpoint=one.logger_endpoint)
     silent.wait_for(20)
     healthy.wait_for(20)
-    until(lambda: "truck-1 in realm live connected" in one.said_by_logger(), "the truck")
+    until(lambda: "truck-1 in realm live connected" in one.logger_output(), "the truck")
     one.kill(one.router)
     until(
-        lambda: "truck-1 in realm live disconnected" in one.said_by_logger(), "the end of its link"
+        lambda: "truck-1 in realm live disconnected" in one.logger_output(), "the end of its link"
     )
-    (boot_id, cut_off_at), *_ = silent.said.items()
+    (boot_id, cut_off_at), *_ = silent.output.items()
     silent.wait_for(cut_off_at + max(60, round(at_least_s * rate)), LONGEST_S + 2.0 * at_least_s)
     if reboots:
         silent.kill()
@@ -60,12 +60,12 @@ def check_silence(
     back_ns = time.time_ns()
     one.start_router()
     until(
-        lambda: one.said_by_logger().count("truck-1 in realm live connected") == 2,
+        lambda: one.logger_output().count("truck-1 in realm live connected") == 2,
         "the truck again",
     )
-    silent.wait_for(max(silent.said.values()) + 20)
+    silent.wait_for(max(silent.output.values()) + 20)
     assert one.finish() == 0  # not one is missing, and none is there twice
-    boots = {boot for truck in one.trucks if truck.vehicle == "truck-1" for boot in truck.said}
+    boots = {boot for truck in one.trucks if truck.vehicle == "truck-1" for boot in truck.output}
     assert len(boots) == 1 + reboots
     found = list(messages_of(one))
     events = [decode_event(m.payload) for m in found if m.key.stream == "event"]

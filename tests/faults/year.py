@@ -109,10 +109,10 @@ def year(out: Path, seed: int, weeks: int = WEEKS) -> int:
 
 def _done(words: list[str]) -> bool:
     """Run a command; print its output only if it fails."""
-    with contextlib.redirect_stdout(io.StringIO()) as said:
+    with contextlib.redirect_stdout(io.StringIO()) as output:
         code = cli.main(words)
     if code != 0:
-        print(said.getvalue(), end="")
+        print(output.getvalue(), end="")
     return code == 0
 
 

@@ -169,12 +169,12 @@ def _copy_project(files: list[str], target: Path) -> None:
 
 def _check_imports(tree: Path) -> None:
     code = "import driveby, pre_core, schemas, services; print(services.__path__[0])"
-    said = subprocess.run(
+    output = subprocess.run(
         [sys.executable, "-c", code], cwd=tree, env=_environment(tree), check=True,
         capture_output=True, text=True,
     )  # fmt: skip
-    if Path(said.stdout.strip()) != tree / "services":
-        raise SystemExit(f"tests of the copy would import {said.stdout.strip()}")
+    if Path(output.stdout.strip()) != tree / "services":
+        raise SystemExit(f"tests of the copy would import {output.stdout.strip()}")
 
 
 def _environment(tree: Path) -> dict[str, str]:
@@ -275,7 +275,7 @@ def _pytest(tree: Path, tests: list[str], limit_s: float, without: Sequence[str]
         start_new_session=True,
     )
     try:
-        said, _ = process.communicate(timeout=limit_s)
+        output, _ = process.communicate(timeout=limit_s)
     except subprocess.TimeoutExpired:
         return Run(None, "", time.monotonic() - began)
     finally:
@@ -283,7 +283,7 @@ def _pytest(tree: Path, tests: list[str], limit_s: float, without: Sequence[str]
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-    failed = re.search(r"^(?:FAILED|ERROR) (\S+::.*?)(?: - .*)?$", said, re.MULTILINE)
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+::.*?)(?: - .*)?$", output, re.MULTILINE)
     # 5: all of them are deselected by default.
     code = 0 if process.returncode == 5 else process.returncode
     return Run(code, failed[1] if failed else "", time.monotonic() - began)

@@ -47,11 +47,11 @@ def test_an_identification_compiles_nothing_after_the_warm_up(project: Path) -> 
         text=True,
         cwd=project,
     )
-    said = json.loads(done.stdout.splitlines()[-1])
-    assert said["crossings"] == 1
+    output = json.loads(done.stdout.splitlines()[-1])
+    assert output["crossings"] == 1
     # What comes from the cache brings its caller's signature only, so there may be few.
-    assert any(kernel.startswith("pre_core.crossing.") for kernel in said["warm"])
-    assert said["new"] == []
+    assert any(kernel.startswith("pre_core.crossing.") for kernel in output["warm"])
+    assert output["new"] == []
 
 
 ROWS = """

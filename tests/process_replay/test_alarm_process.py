@@ -188,7 +188,7 @@ def _texts_in(path: Path) -> Iterator[str]:
         for chunk in RrdReader(path).stream():
             batch = chunk.to_record_batch()
             for name in batch.schema.names:
-                if chunk.entity_path == "/said/bridge-1" and name.endswith("TextDocument:text"):
+                if chunk.entity_path == "/newest/bridge-1" and name.endswith("TextDocument:text"):
                     yield from (one[0] for one in batch.column(name).to_pylist())
 
 

@@ -50,10 +50,10 @@ class Host:
 
     def environment(self, name: str, container: str) -> dict[str, str]:
         """Nothing of this process's, but what the image and the file say."""
-        said: dict[str, str] = IMAGE_ENV | SERVICES[name].get("environment", {})
-        said["NUMBA_CACHE_DIR"] = str(self.cache(container))
+        output: dict[str, str] = IMAGE_ENV | SERVICES[name].get("environment", {})
+        output["NUMBA_CACHE_DIR"] = str(self.cache(container))
         path = f"{Path(sys.executable).parent}:/usr/bin:/bin"
-        return said | {"PATH": path, "HOME": "/nonexistent", "KERNELS": str(self.kernels)}
+        return output | {"PATH": path, "HOME": "/nonexistent", "KERNELS": str(self.kernels)}
 
     def cache(self, container: str) -> Path:
         return self.folder / "run" / container / "kernels"

@@ -236,9 +236,9 @@ def test_demo_with_open_viewer_stays_until_it_is_ended(tmp_path: Path, project: 
     # BROWSER: none of the machine's is to open.
     own = {**os.environ, "HOME": str(tmp_path), "BROWSER": "true", "PYTHONUNBUFFERED": "1"}
     address = re.compile(r"The live view stays until Ctrl-C, at (http://127\.0\.0\.1:\S+)\n")
-    with log.open("wb") as said:
+    with log.open("wb") as output:
         arguments = [*command(folder), "--noise", "0", "--web"]
-        demo = subprocess.Popen(arguments, cwd=project, env=own, stdout=said)
+        demo = subprocess.Popen(arguments, cwd=project, env=own, stdout=output)
     try:
         until(lambda: address.search(log.read_text()) or demo.poll() is not None)
         found = address.search(log.read_text())

@@ -102,9 +102,11 @@ def test_a_worker_in_the_wrong_realm_says_so(
         publisher = Publisher(bus, "sim-two")
         publisher.put("vehicle", "truck-1", "info", b"")
         assert worker.stderr is not None
-        said = ""
-        while "nothing in realm" not in said:
-            said = worker.stderr.readline()
-            assert said, "it has ended"
-        assert said.endswith("nothing in realm sim-one, but truck-1 in sim-two: --realm sim-two\n")
+        output = ""
+        while "nothing in realm" not in output:
+            output = worker.stderr.readline()
+            assert output, "it has ended"
+        assert output.endswith(
+            "nothing in realm sim-one, but truck-1 in sim-two: --realm sim-two\n"
+        )
         publisher.close()

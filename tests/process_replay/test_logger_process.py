@@ -128,8 +128,8 @@ def test_interrupt_finishes_the_file(start: Start, endpoint: str, tmp_path: Path
 
 
 def is_on_disk(session: zenoh.Session, number: int) -> bool:
-    said = get_latest(session, selector("live", "service", "durable"), LONGEST_S)
-    streams = [one for payload in said for one in pb.Durable.FromString(payload).streams]
+    output = get_latest(session, selector("live", "service", "durable"), LONGEST_S)
+    streams = [one for payload in output for one in pb.Durable.FromString(payload).streams]
     return sum(one.count for one in streams if one.stream == "gnss") >= number
 
 
@@ -206,22 +206,22 @@ def test_full_disk_is_reported_and_ends_the_logger(
         assert logger.returncode == 1
         assert log.splitlines()[-1] == "recording stopped: File too large"
         assert "Traceback" not in log
-        said: list[RawSample] = []
+        output: list[RawSample] = []
 
         def is_reported() -> bool:
             if (received := services.receive(0.1)) is not None:
-                said.append(received)
+                output.append(received)
             return any(
                 r.key_text.endswith("health") and not pb.Health.FromString(r.payload).ok
-                for r in said
+                for r in output
             )
 
         until(is_reported, "that it is not well")
         while (received := services.receive(0.1)) is not None:
-            said.append(received)
-    health = [pb.Health.FromString(r.payload) for r in said if r.key_text.endswith("health")]
+            output.append(received)
+    health = [pb.Health.FromString(r.payload) for r in output if r.key_text.endswith("health")]
     assert not health[-1].ok
-    events = [decode_event(r.payload) for r in said if r.key_text.endswith("event")]
+    events = [decode_event(r.payload) for r in output if r.key_text.endswith("event")]
     assert EventKind.WRITE_ERROR in [event.kind for event in events]
     info = read_info(tmp_path / "live.mcap")
     assert (info.truncated, info.damaged_chunks) == (False, 0)

@@ -49,8 +49,8 @@ def heard_at(endpoint: str) -> Iterator[Iterator[RawSample]]:
 
 def on_disk(session: zenoh.Session) -> int:
     """How many batches the logger says are on its disk."""
-    said = get_latest(session, selector("live", "service", "durable"), LONGEST_S)
-    streams = [one for payload in said for one in pb.Durable.FromString(payload).streams]
+    output = get_latest(session, selector("live", "service", "durable"), LONGEST_S)
+    streams = [one for payload in output for one in pb.Durable.FromString(payload).streams]
     return sum(one.count for one in streams if one.stream == "accel")
 
 

@@ -393,7 +393,9 @@ def test_flood_fills_no_memory_and_costs_other_topics_nothing(
         for number in range(100):
             stamp_ns = FIRST_NS + number * 1_000_000
             node.publish(ros2.Ros(rear, IMU, ros2.imu(stamp_ns, 0.0), stamp_ns))
-        until(lambda: len(hearing._waiting[rear]) == 100, "what the other topic's sensor said")
+        until(
+            lambda: len(hearing._waiting[rear]) == 100, "the messages of the other topic's sensor"
+        )
         kept = 0
         while (heard := hearing.next(front)) is not None:
             kept += 1

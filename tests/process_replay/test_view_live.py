@@ -129,11 +129,11 @@ def test_query_of_the_wrong_realm_is_explained(
         publisher = Publisher(bus, "replay-monday")
         publisher.put("vehicle", "truck-1", "info", b"")
         assert view.stderr is not None
-        said = ""
+        output = ""
         deadline = time.monotonic() + LONGEST_S
-        while "nothing in realm" not in said and time.monotonic() < deadline:
-            said = view.stderr.readline()
-        assert said.endswith(
+        while "nothing in realm" not in output and time.monotonic() < deadline:
+            output = view.stderr.readline()
+        assert output.endswith(
             "nothing in realm live, but truck-1 in replay-monday: --realm replay-monday\n"
         )
         publisher.close()
@@ -146,8 +146,8 @@ def test_in_a_browser_until_it_is_closed(endpoint: str, tmp_path: Path) -> None:
     command += ["--port", str(free_port())]
     log = tmp_path / "view.log"
     for end in ("viewer", "command"):
-        with log.open("wb") as said:
-            view = subprocess.Popen(command, env=own, stdout=said, stderr=said)
+        with log.open("wb") as output:
+            view = subprocess.Popen(command, env=own, stdout=output, stderr=output)
         try:
             until(lambda: re.search(r"in a browser: http://127.0.0.1:\d+\?url=", log.read_text()))
             until(partial(children, view.pid), "the viewer")
@@ -171,8 +171,8 @@ def test_it_is_seen_in_a_browser(
     with browser(tmp_path) as tab, open_session(connect=endpoint, timeout_s=LONGEST_S) as bus:
         publisher = Publisher(bus, "live")
         drive(publisher, project)
-        with log.open("wb") as said:
-            view = subprocess.Popen(command, env=own, stdout=said, stderr=said)
+        with log.open("wb") as output:
+            view = subprocess.Popen(command, env=own, stdout=output, stderr=output)
         try:
             until(lambda: "in a browser: " in log.read_text())
             page = re.findall(r"in a browser: (\S+)", log.read_text())[0]

@@ -36,7 +36,7 @@ def publisher(start: Start, endpoint: str, tmp_path: Path) -> Iterator[Publisher
         publisher.close()
 
 
-def say_result(publisher: Publisher, project: Path) -> None:
+def print_result(publisher: Publisher, project: Path) -> None:
     crossing = result(load_site(project / "docs/site.example.toml"), "a")
     message = crossing_to_protobuf(crossing, ResultHeader("0.1.0", 1.79e9, "hash", {}, 1))
     publisher.put("bridge", "bridge-1", "estimate", message.SerializeToString())
@@ -46,17 +46,17 @@ def say_result(publisher: Publisher, project: Path) -> None:
 def test_lines_into_a_pipe(
     publisher: Publisher, endpoint: str, project: Path, number: signal.Signals
 ) -> None:
-    say_result(publisher, project)  # before it looks
+    print_result(publisher, project)  # before it looks
     watch = subprocess.Popen(
         [*COMMAND, endpoint], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     try:
         assert watch.stdout is not None
         wanted = "truck-1 → bridge-1: good, lowest EI_4 0.400 of nominal (95 %: 0.377 to 0.424)"
-        for said in watch.stdout:
-            found = LINE.fullmatch(said)
-            assert found, said
-            assert "\x1b" not in said
+        for output in watch.stdout:
+            found = LINE.fullmatch(output)
+            assert found, output
+            assert "\x1b" not in output
             if found[1] == wanted:
                 break
         else:
@@ -85,7 +85,7 @@ def test_wrong_realm_is_reported(publisher: Publisher, endpoint: str) -> None:
 
 
 def test_a_page_on_a_terminal(publisher: Publisher, endpoint: str, project: Path) -> None:
-    say_result(publisher, project)
+    print_result(publisher, project)
     ours, theirs = pty.openpty()
     own = {**os.environ, "TERM": "xterm", "COLUMNS": "80", "LINES": "24"}
     watch = subprocess.Popen([*COMMAND, endpoint], stdout=theirs, stderr=theirs, env=own)

@@ -192,8 +192,8 @@ def test_unusable_or_unknown_truck_is_reported_live(
     sent = drive_on
     if who == "itself":
         heavy = '[vehicle]\nid = "truck-1"\ntotal_mass_kg = 30000.0\nwheelbase_m = 7.0\n'
-        said = decode_info(drive_on[0].payload)._replace(site_toml=heavy)
-        sent = [drive_on[0]._replace(payload=encode_info(said)), *drive_on[1:]]
+        output = decode_info(drive_on[0].payload)._replace(site_toml=heavy)
+        sent = [drive_on[0]._replace(payload=encode_info(output)), *drive_on[1:]]
     else:
         theirs = [
             message._replace(key=message.key._replace(identifier=who))

@@ -70,8 +70,8 @@ def test_missing_excitation_is_stated_next_to_a_step() -> None:
     """A flat road excites the truck no more than the sensors' noise is: 5.5 mm/s² at 1 kHz."""
     noise = np.random.default_rng(1).standard_normal((4, 5000))
     densities, step_s = (25.0,) * 4, 1e-3
-    said = checks.weak_excitation(densities, 1.7 * 5.48e-3 * noise, step_s)
-    assert said.startswith(
+    output = checks.weak_excitation(densities, 1.7 * 5.48e-3 * noise, step_s)
+    assert output.startswith(
         "but the RMS of all accelerations is at most 1.7 times the sensors' noise"
     )
     louder = 5.48e-3 * noise * np.array([[1.0], [1.0], [1.0], [4.0]])

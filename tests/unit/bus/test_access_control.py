@@ -29,7 +29,7 @@ def test_roles_publish_and_read_alarms_as_granted(role: str, hears: bool, says: 
 
 
 def test_truck_publishes_events_of_its_own_gateway_only() -> None:
-    said = published_by(Subject("truck", "truck-1"))
-    events = [expression for expression in said if expression.endswith("/event")]
+    output = published_by(Subject("truck", "truck-1"))
+    events = [expression for expression in output if expression.endswith("/event")]
     assert events == [key("live", "service", "gateway-truck-1", "event").replace("live", "*")]
     assert gateway_service("x" * 63) == f"gateway-{'x' * 55}"

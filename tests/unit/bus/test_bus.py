@@ -197,16 +197,16 @@ def test_delivery_waits_until_everything_is_on_disk(
 ) -> None:
     logger = Publisher(router, "live")
     durable(logger, 4)
-    said = threading.Event()
+    output = threading.Event()
 
-    def say_the_rest() -> None:
-        said.set()
+    def print_the_rest() -> None:
+        output.set()
         durable(logger, 10)
 
-    timer = threading.Timer(0.5, say_the_rest)
+    timer = threading.Timer(0.5, print_the_rest)
     timer.start()
     assert delivery.wait(LONGEST_S) == 0
-    assert said.is_set()
+    assert output.is_set()
     timer.join()
     logger.close()
 

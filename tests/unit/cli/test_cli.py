@@ -567,8 +567,8 @@ def test_no_command_replaces_a_recording_by_accident_or_while_it_is_written(
     forces = [[], ["--force"]] if command != "identify" else [[]]
     for force in forces:
         assert cli.main([command, *arguments, str(target), *force]) == 2
-        assert "is being written at this moment" in (said := capsys.readouterr().err)
-        assert said.count("\n") == 1
+        assert "is being written at this moment" in (printed := capsys.readouterr().err)
+        assert printed.count("\n") == 1
     living.finish("done")
     content = target.read_bytes()
     assert cli.main([command, *arguments, str(target)]) == 2

@@ -54,8 +54,8 @@ def test_words_are_completed(
 ) -> None:
     script = script_for("bash", tmp_path, capsys)
     command = ["bash", "-c", ASK, "bash", str(script), "driveby", *words]
-    said = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert set(said.stdout.split()) == expected, said.stderr
+    output = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert set(output.stdout.split()) == expected, output.stderr
 
 
 def test_every_command_and_option_is_in_it(capsys: pytest.CaptureFixture[str]) -> None:

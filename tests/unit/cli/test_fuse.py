@@ -25,11 +25,11 @@ def test_duplicate_results_count_once_and_are_reported(
 def test_wider_intervals_are_explained_for_one_crossing_only(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for number, said in ((1, True), (2, False)):
+    for number, output in ((1, True), (2, False)):
         path = write(tmp_path / "r.json", [crossing(n) for n in range(number)])
         assert main(["fuse", str(path)]) == 0
         out = " ".join(capsys.readouterr().out.split())
-        assert ("single crossing: intervals include" in out) is said
+        assert ("single crossing: intervals include" in out) is output
 
 
 def test_a_recording_is_refused_with_what_is_wanted(
@@ -45,7 +45,7 @@ def test_a_recording_is_refused_with_what_is_wanted(
 def test_combined_days_name_the_commands_that_show_a_change(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for second, is_said in (("20260101T120000.000Z", False), ("20260102T110000.000Z", True)):
+    for second, is_printed in (("20260101T120000.000Z", False), ("20260102T110000.000Z", True)):
         names = [f"truck-1.bridge-1.{entry}" for entry in ("20260101T110000.000Z", second)]
         some = [
             crossing(n).model_copy(update={"crossing_id": name}) for n, name in enumerate(names)
@@ -53,7 +53,7 @@ def test_combined_days_name_the_commands_that_show_a_change(
         path = write(tmp_path / "r.json", some)
         assert main(["fuse", str(path)]) == 0
         out = " ".join(capsys.readouterr().out.split())
-        assert ("whether EI changed between them: driveby history" in out) is is_said
+        assert ("whether EI changed between them: driveby history" in out) is is_printed
 
 
 @pytest.mark.parametrize(

@@ -122,9 +122,9 @@ def test_a_folder_without_results_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert add(tmp_path, tmp_path) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert f"{tmp_path}: has no results, HASH.parquet of driveby identify --into" in said
+    output = capsys.readouterr().err
+    assert output.count("\n") == 1
+    assert f"{tmp_path}: has no results, HASH.parquet of driveby identify --into" in output
     assert not (tmp_path / "history").exists()
 
 

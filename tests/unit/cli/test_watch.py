@@ -109,8 +109,8 @@ def test_bars_say_which_element_is_weak() -> None:
 
 def test_lines_for_a_pipe(site: Site) -> None:
     watched = RealmModel()
-    said = [one for one in drives(watched, "truck-1") if one is not None]
-    said += [
+    output = [one for one in drives(watched, "truck-1") if one is not None]
+    output += [
         one
         for message in (
             state("a", pb.DETECTED, "truck-1", 0.0),
@@ -125,7 +125,7 @@ def test_lines_for_a_pipe(site: Site) -> None:
         )
         if (one := deliver(watched, message)) is not None
     ]
-    assert said == [
+    assert output == [
         "truck-1 drives",
         "truck-1 → bridge-1: on the bridge",
         "truck-1 → bridge-1: complete",
@@ -218,10 +218,10 @@ SENTENCE = "element 4 is 10 % less stiff than before 2026-08-27 (95 % interval 8
 
 def test_an_alarm_is_a_line_until_it_is_another(site: Site) -> None:
     watched = RealmModel()
-    said = [
+    output = [
         deliver(watched, one) for one in (alarm(), alarm(), alarm(by="owner"), alarm(by="owner"))
     ]
-    assert said == [
+    assert output == [
         f"alarm of bridge-1: {SENTENCE}: active",
         None,
         f"alarm of bridge-1: {SENTENCE}: acknowledged by owner",
@@ -277,13 +277,13 @@ def test_bad_options_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_absent_alarms_are_no_reassurance_on_the_page(site: Site) -> None:
     """The page cannot know whether bridges are watched, and says so until an alarm comes."""
-    said = "No alarm was received; it is not known here whether driveby alarm serve watches"
+    output = "No alarm was received; it is not known here whether driveby alarm serve watches"
     watched = RealmModel()
-    assert not any(one.startswith(said) for one in drawn(watched))
+    assert not any(one.startswith(output) for one in drawn(watched))
     deliver(watched, bridge_state(site))
-    assert line(drawn(watched), said).endswith("any bridge.")
+    assert line(drawn(watched), output).endswith("any bridge.")
     deliver(watched, alarm())
-    assert not any(one.startswith(said) for one in drawn(watched))
+    assert not any(one.startswith(output) for one in drawn(watched))
 
 
 def test_clock_that_is_behind_is_explained() -> None:
@@ -292,9 +292,9 @@ def test_clock_that_is_behind_is_explained() -> None:
     drives(watched, "truck-2", lag_s=1.0)
     drives(watched, "truck-3", lag_s=30.0)
     watched.trucks["truck-3"].lags_s.extend([9.0] * 50)  # it catches up
-    said = "truck-1 by 9.0 s: all samples are equally old: the clock of the truck is behind"
+    output = "truck-1 by 9.0 s: all samples are equally old: the clock of the truck is behind"
     lines = [one.strip() for one in drawn(watched)]
-    assert [one for one in lines if "equally old" in one] == [f"{said}, or this one's ahead"]
+    assert [one for one in lines if "equally old" in one] == [f"{output}, or this one's ahead"]
     replayed = drawn(watched, listened=Listened("replay-monday"))
     assert not any("equally old" in one for one in replayed)
 

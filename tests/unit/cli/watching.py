@@ -43,17 +43,17 @@ def drives(
 ) -> list[str | None]:
     """Five seconds of a truck: 20 batches and 10 fixes a second."""
     names = ("sprung_front", "sprung_rear", "unsprung_front", "unsprung_rear")[:channels]
-    said = []
+    output = []
     for number in range(100):
         since_s = ago_s + 4.95 - 0.05 * number
         time_ns = NOW_NS - round((since_s + lag_s + 0.05) * 1e9)
         batch = {one: AccelChannel(1000.0, np.zeros(50)) for one in names}
         payload = encode_accel(AccelBatch(1, number, number, time_ns, batch))
-        said.append(deliver(watched, heard("vehicle", name, "accel", payload), since_s))
+        output.append(deliver(watched, heard("vehicle", name, "accel", payload), since_s))
         if number % 2 == 0:
             fix = encode_gnss(GnssFix(1, number, number, time_ns, 36.0, 140.0, 20.0, 9.8))
-            said.append(deliver(watched, heard("vehicle", name, "gnss", fix), since_s))
-    return said
+            output.append(deliver(watched, heard("vehicle", name, "gnss", fix), since_s))
+    return output
 
 
 def state(

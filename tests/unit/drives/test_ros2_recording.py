@@ -274,10 +274,10 @@ def a_chunk(compression: bytes, packed: bytes, size: int) -> bytes:
     return b"\x89MCAP0\r\n" + body + b"\x89MCAP0\r\n"
 
 
-@pytest.mark.parametrize("said", [1000, 1 << 40])
+@pytest.mark.parametrize("printed", [1000, 1 << 40])
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 def test_what_unpacks_to_too_much_is_refused(
-    tmp_path: Path, complaint: Complaint, compression: str, said: int
+    tmp_path: Path, complaint: Complaint, compression: str, printed: int
 ) -> None:
     """Whether it says that so much comes, or that little does."""
     import lz4.frame
@@ -285,9 +285,9 @@ def test_what_unpacks_to_too_much_is_refused(
     zeros = bytes(1 << 28)
     packed = zstandard.compress(zeros) if compression == "zstd" else lz4.frame.compress(zeros)
     path = tmp_path / "drive.mcap"
-    path.write_bytes(a_chunk(compression.encode(), packed, said))
+    path.write_bytes(a_chunk(compression.encode(), packed, printed))
     line = complaint(path)
-    expected = "expected 1000 bytes, got 1001" if said == 1000 else f"a chunk of {said} bytes"
+    expected = "expected 1000 bytes, got 1001" if printed == 1000 else f"a chunk of {printed} bytes"
     assert expected in line
 
 
@@ -460,7 +460,10 @@ def test_what_is_imported_is_never_written_over(
     folder = ros2.record(tmp_path / "bag", messages, StoragePlugin.MCAP)
     path = folder / "bag.mcap"
     before = path.read_bytes()
-    for source, said in ((path, "is read by this command"), (folder, "is what is to be imported")):
+    for source, printed in (
+        (path, "is read by this command"),
+        (folder, "is what is to be imported"),
+    ):
         assert imported(source, site, path) == 2
-        assert said in capsys.readouterr().err
+        assert printed in capsys.readouterr().err
     assert path.read_bytes() == before

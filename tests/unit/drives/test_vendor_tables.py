@@ -722,8 +722,8 @@ def test_vendor_table_gives_the_samples_of_the_exact_file(name: str, tmp_path: P
     found = understood_runs([folder], site, "truck-x", variant.how)
     (run,) = found.runs
     check(run, variant, site)
-    said = [guess.text for guess in found.guesses]
-    assert any(variant.note in text for text in said) or not variant.note, said
+    output = [guess.text for guess in found.guesses]
+    assert any(variant.note in text for text in output) or not variant.note, output
     conversions = "; ".join(found.conversions())
     if variant.guessed is None:
         assert conversions == ""

@@ -63,8 +63,8 @@ from tests.working_engine import feed_all
 
 def works() -> list[IdentificationTask]:
     engine = Engine(SITE, SETTINGS, HEADER)
-    said = [one for m in TWO for one in engine.feed(m.key, m.payload)]
-    return [one for one in said if isinstance(one, IdentificationTask)]
+    printed = [one for m in TWO for one in engine.feed(m.key, m.payload)]
+    return [one for one in printed if isinstance(one, IdentificationTask)]
 
 
 def all_of(processes: ProcessExecutor) -> list[TaskResult]:
@@ -117,8 +117,8 @@ def test_a_process_that_dies_twice_costs_its_own_crossing_only(
     assert results[first.number].verdict == "good"
     assert results[second.number].reasons == ("failed",)
     assert results[second.number].speed_m_per_s == pytest.approx(10.0, rel=0.01)
-    said = [record.getMessage() for record in caplog.records]
-    assert sum("retrying once" in text for text in said) == 1
+    printed = [record.getMessage() for record in caplog.records]
+    assert sum("retrying once" in text for text in printed) == 1
 
 
 def test_a_process_that_dies_once_costs_nothing(
@@ -159,10 +159,10 @@ def test_a_hung_process_is_ended_and_its_crossing_fails_at_the_second_time(
         results = {work.number: result for work, result in all_of(processes)}
         assert (processes.running, processes.waiting) == ([], 0)
     assert results[first.number].reasons == ("failed",)
-    said = [record.getMessage() for record in caplog.records]
+    printed = [record.getMessage() for record in caplog.records]
     hung = f"the process that works on {first.crossing_id} {why}; ending it"
-    assert said.count(hung) == 2
-    assert sum(f"{first.crossing_id} died; retrying once" in text for text in said) == 1
+    assert printed.count(hung) == 2
+    assert sum(f"{first.crossing_id} died; retrying once" in text for text in printed) == 1
     assert (results[second.number].verdict == "good") == (search is busy)
 
 
@@ -297,9 +297,9 @@ def test_results_may_come_back_in_any_order() -> None:
     orders = {}
     for order in ((0, 1, 2), (2, 1, 0), (1, 0, 2)):
         engine = Engine(SITE, SETTINGS, HEADER)
-        said = [one for m in more for one in engine.feed(m.key, m.payload)]
-        said += list(engine.finish())
-        found = [one for one in said if isinstance(one, IdentificationTask)]
+        printed = [one for m in more for one in engine.feed(m.key, m.payload)]
+        printed += list(engine.finish())
+        found = [one for one in printed if isinstance(one, IdentificationTask)]
         assert len(found) == 3
         reported = []
         for n in order:
@@ -400,10 +400,10 @@ def test_what_cannot_be_fused_costs_its_own_state_only(
         processes.submit(works()[0])
         (finished,) = all_of(processes)
     assert finished.result.verdict == "good"
-    said = [record.getMessage() for record in caplog.records]
+    printed = [record.getMessage() for record in caplog.records]
     again = "the process that worked on the state of bridge-1 died; retrying once"
-    assert said.count(again) == (make is not bad)
-    assert any("the state of bridge-1 died again" in text for text in said) == (make is not bad)
+    assert printed.count(again) == (make is not bad)
+    assert any("the state of bridge-1 died again" in text for text in printed) == (make is not bad)
 
 
 def test_a_process_that_dies_once_while_it_fuses_costs_nothing(marks: Path) -> None:

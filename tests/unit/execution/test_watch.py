@@ -31,8 +31,8 @@ def test_processor_time_counts_and_no_clock(taken: list[float | None]) -> None:
 
 def test_idle_process_counts_as_hung_after_its_limit(taken: list[float | None]) -> None:
     one = HangWatchdog(1, LIMITS, 0.0)
-    said = [one.why_hung(0.5 * n) for n in range(1, 12)]
-    assert said == [""] * 10 + ["has done nothing for 5 s"]
+    output = [one.why_hung(0.5 * n) for n in range(1, 12)]
+    assert output == [""] * 10 + ["has done nothing for 5 s"]
     taken.append(100.01)
     assert one.why_hung(6.0) == ""
 

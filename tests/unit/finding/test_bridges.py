@@ -177,9 +177,9 @@ def test_far_above_or_below_the_deck_is_another_road(
     known = bridge("known", (0.0, 0.0), (SPAN_M, 0.0), 100.0)
     drive = fixes(straight(), altitude_m=altitude_m)
     assert len(names([known], drive)) == count
-    said = [record.getMessage() for record in caplog.records]
-    assert len(said) == 1 - count
-    assert all("known: a truck drove along it, but 1" in line for line in said)
+    output = [record.getMessage() for record in caplog.records]
+    assert len(output) == 1 - count
+    assert all("known: a truck drove along it, but 1" in line for line in output)
     assert len(names([ONE], drive)) == 1
 
 

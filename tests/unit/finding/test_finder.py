@@ -32,8 +32,8 @@ def test_each_crossing_is_detected_once_and_complete_once() -> None:
 
 def test_a_finder_gives_the_data_that_an_engine_works_on() -> None:
     engine = Engine(SITE, SETTINGS, HEADER)
-    said = [one for m in TWO for one in engine.feed(m.key, m.payload)]
-    works = [one.data for one in said if isinstance(one, IdentificationTask)]
+    output = [one for m in TWO for one in engine.feed(m.key, m.payload)]
+    works = [one.data for one in output if isinstance(one, IdentificationTask)]
     alone = list(crossings_in(((m.key, m.payload) for m in TWO), SITE, close_window))
     assert [one.crossing_id for one in alone] == [one.crossing_id for one in works]
     assert [one.stay for one in alone] == [one.stay for one in works]

@@ -140,17 +140,17 @@ def test_a_file_that_grows_or_shrinks_meanwhile() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sent", "said"),
+    ("sent", "output"),
     [
         ([fix("a", 1, 0)], "x.mcap: no accelerations (accel), a recording of a truck is expected"),
         ([batch("a", 1, 0)], "x.mcap: no positions (gnss), a recording of a truck is expected"),
         ([_message("a", "accel", 1, 4, b"\xff")], "x.mcap: accel 4: not a driveby.v1.AccelBatch"),
     ],
 )
-def test_what_is_no_drive(sent: list[Message], said: str) -> None:
+def test_what_is_no_drive(sent: list[Message], output: str) -> None:
     with pytest.raises(InputError) as caught:
         index_messages("x.mcap", lambda: sent, SITE)
-    assert str(caught.value).startswith(said)
+    assert str(caught.value).startswith(output)
 
 
 def test_second_drive_of_one_start_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:

@@ -279,13 +279,13 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
         f"bridge-2 in realm sim-fleet: Not monitored: {never}",
     ]
     assert cli.main(["alarm", "check", *there]) == 0
-    said = capsys.readouterr().out
-    assert said.startswith("2 bridges checked, 1 new alarm\nalarm 2025")
-    assert "-4-weaker of bridge-2, raised 2025-" in said
+    output = capsys.readouterr().out
+    assert output.startswith("2 bridges checked, 1 new alarm\nalarm 2025")
+    assert "-4-weaker of bridge-2, raised 2025-" in output
     how = "then acknowledge the alarm: driveby alarm ack BRIDGE --by NAME --note TEXT\n"
-    assert said.endswith(how)
-    assert "\nan alarm compares periods; identify and fuse combine all crossings" in said
-    assert "\n2 of 2 bridges monitored\n" in said
+    assert output.endswith(how)
+    assert "\nan alarm compares periods; identify and fuse combine all crossings" in output
+    assert "\n2 of 2 bridges monitored\n" in output
     assert cli.main(["alarm", "list", *there]) == 0
     assert capsys.readouterr().out.endswith(how)
     assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", "--note", "props", *there]) == 0
@@ -334,7 +334,7 @@ def test_an_acknowledgement_that_is_damaged_can_be_given_again(
 
 
 @pytest.mark.parametrize(
-    ("said", "line"),
+    ("output", "line"),
     [
         (["--by", "x" * 201], "--by: String should have at most 200 characters"),
         (["--by", "owner", "--note", "x" * 1001], "--note: String should have at most 1000"),
@@ -342,10 +342,10 @@ def test_an_acknowledgement_that_is_damaged_can_be_given_again(
     ],
 )
 def test_invalid_acknowledgement_gives_one_line(
-    history: Path, capsys: pytest.CaptureFixture[str], said: list[str], line: str
+    history: Path, capsys: pytest.CaptureFixture[str], output: list[str], line: str
 ) -> None:
     check(history, AlarmSettings(), AFTER_S)
-    assert cli.main(["alarm", "ack", "bridge-2", *said, "--history", str(history)]) == 2
+    assert cli.main(["alarm", "ack", "bridge-2", *output, "--history", str(history)]) == 2
     assert capsys.readouterr().err.startswith(f"driveby: {line}")
     assert len(standing_alarms(history)[0]) == 1
 
@@ -372,8 +372,8 @@ def test_an_alarm_in_another_place_than_its_own_gets_a_line(history: Path) -> No
     found, problems = standing_alarms(history)
     assert found == [alarm]
     for wrong in (copy, elsewhere):
-        said = f"{wrong}: is alarm {alarm.alarm_id} of bridge-2 in realm sim-fleet, which"
-        assert any(line.startswith(said) for line in problems)
+        output = f"{wrong}: is alarm {alarm.alarm_id} of bridge-2 in realm sim-fleet, which"
+        assert any(line.startswith(output) for line in problems)
 
 
 def test_an_alarm_stands_though_its_crossings_are_gone(

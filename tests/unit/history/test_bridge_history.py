@@ -159,9 +159,9 @@ def test_two_different_months_are_named_without_a_judgement(
     assert outcome.text.endswith("not corrected for temperature or season.")
     assert cli.main(["history", "bridge-1", "--history", str(folder), "--json",
                      str(tmp_path / "h.json"), "--figures", str(tmp_path)]) == 0  # fmt: skip
-    said = capsys.readouterr().out
-    assert never.text in said
-    assert outcome.text in said
+    printed = capsys.readouterr().out
+    assert never.text in printed
+    assert outcome.text in printed
     kept = json.loads((tmp_path / "h.json").read_text())
     assert kept["watch"]["state"] == "never_checked"
     assert kept["comparison"]["elements"]["EI_4"]["q975"] == pytest.approx(of_it.high)
@@ -197,15 +197,15 @@ def test_one_month_is_nothing_to_compare_with(
 
 
 def test_an_alarm_stands_until_somebody_has_taken_note_of_it(past: BridgeHistory) -> None:
-    said = "element 4 is 20 % less stiff than before 2026-03-05 (95 % interval 18 to 22 %)."
+    printed = "element 4 is 20 % less stiff than before 2026-03-05 (95 % interval 18 to 22 %)."
     standing = past._replace(alarms=(alarm(),))
     text = Seen(history_section(standing, "h-")).text
-    assert f"Alarm of 2026-03-10: {said} The alarm is active: it is not acknowledged." in text
+    assert f"Alarm of 2026-03-10: {printed} The alarm is active: it is not acknowledged." in text
     assert "; 1 active alarm (see" in history_summary(standing)
     note = Acknowledgement(by="<b>Anna</b>", time=BEGIN_S + 9 * DAY_S, note="frozen")
     noted = past._replace(alarms=(alarm().model_copy(update={"acknowledged": note}),))
     found = Seen(history_section(noted, "h-"))
-    assert f"{said} <b>Anna</b> acknowledged it on 2026-03-11: frozen" in found.text
+    assert f"{printed} <b>Anna</b> acknowledged it on 2026-03-11: frozen" in found.text
     assert "b" not in found.tags  # what somebody wrote is text
     assert "; not monitored for changes (see" in history_summary(noted)
     both = past._replace(alarms=(alarm(), alarm()))

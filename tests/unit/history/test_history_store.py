@@ -181,11 +181,11 @@ def test_a_row_whose_bytes_are_damaged_gets_a_line(tmp_path: Path) -> None:
     add_results(tmp_path, some)
     kept = list(read_partition(where(tmp_path), ("likelihood", "observation")).crossings)
     kept[1] = kept[1]._replace(likelihood=(kept[1].likelihood or b"")[:-9], content="f" * 32)
-    said: list[str] = []
-    (period,) = fused_periods(tmp_path, "sim-fleet", "bridge-1", kept, "week", said.append)
+    output: list[str] = []
+    (period,) = fused_periods(tmp_path, "sim-fleet", "bridge-1", kept, "week", output.append)
     assert period.state is not None
     assert len(period.state.crossings_used) == 2
-    (line,) = said
+    (line,) = output
     assert line.startswith(f"{kept[1].crossing_id}: left out: its likelihood cannot be read")
 
 
@@ -247,8 +247,8 @@ def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     drawn = ["--figures", str(folder), "--rrd", str(tmp_path / "h.rrd")]
     written = ["--csv", str(table), "--json", str(outcome), *drawn]
     assert cli.main(["history", "bridge-1", "--history", history, *written]) == 0
-    said = capsys.readouterr().out
-    assert "bridge-1 in realm sim-fleet: 5 crossings in 1 month" in said
+    output = capsys.readouterr().out
+    assert "bridge-1 in realm sim-fleet: 5 crossings in 1 month" in output
     assert len(table.read_text().splitlines()) == 1 + 7
     (period,) = json.loads(outcome.read_text())["periods"]
     assert period["crossings"] == 5
@@ -377,9 +377,9 @@ def test_bad_rows_get_a_line_and_the_others_are_read(
     lines: list[str] = []
     for words in (["history", "bridge-1"], ["history"], ["alarm", "check", "--all"]):
         assert cli.main([*words, *there]) in (0, 2)
-        said = capsys.readouterr()
-        assert "internal error" not in said.err
-        lost = [one for one in (said.out + said.err).splitlines() if "left out" in one]
+        output = capsys.readouterr()
+        assert "internal error" not in output.err
+        lost = [one for one in (output.out + output.err).splitlines() if "left out" in one]
         assert len(lost) <= 1
         assert all(one.startswith((f"{path}: ", f"{name}: ")) for one in lost)
         lines += lost

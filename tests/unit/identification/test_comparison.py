@@ -60,8 +60,8 @@ def test_a_wrong_nominal_value_changes_no_comparison(guess: float) -> None:
         [e.ratio for e in compared().elements]
     )
     assert compared(np.full(7, guess)).weak == ()
-    (said,) = sentences(compared(np.full(7, guess)))
-    assert said == ENGLISH.text("all.others", within=1, loss=16)
+    (output,) = sentences(compared(np.full(7, guess)))
+    assert output == ENGLISH.text("all.others", within=1, loss=16)
 
 
 def test_what_all_elements_have_in_common_is_no_error_of_a_comparison() -> None:
@@ -78,8 +78,8 @@ def test_a_loss_is_clear_only_if_all_of_its_interval_is() -> None:
     ratios = np.array([1.0, 1.0, 0.85, 1.0, 1.0])
     assert [e.number for e in compared(ratios, relative=0.01).weak] == [3]
     assert compared(ratios, relative=0.05).weak == ()
-    (said,) = sentences(compared(ratios, relative=0.05))
-    assert said.startswith(ENGLISH.text("all.others", within=15, loss=0).partition(" 0 %")[0])
+    (output,) = sentences(compared(ratios, relative=0.05))
+    assert output.startswith(ENGLISH.text("all.others", within=15, loss=0).partition(" 0 %")[0])
 
 
 def test_the_smallest_loss_that_would_be_clear_is_clear_and_a_smaller_one_is_not() -> None:
@@ -112,9 +112,9 @@ def test_weak_elements_come_first_and_stiffer_ones_are_named() -> None:
     found = compared(ratios)
     assert [element.number for element in found.weak] == [4, 2]
     assert [element.number for element in found.stiff] == [6]
-    said = sentences(found)
-    assert said[0].startswith("Element 4, 12.9 to 17.1 m: 70 % less stiff")
-    assert said[2].startswith("Element 6, 21.4 to 25.7 m: 50 % stiffer than the other elements")
+    output = sentences(found)
+    assert output[0].startswith("Element 4, 12.9 to 17.1 m: 70 % less stiff")
+    assert output[2].startswith("Element 6, 21.4 to 25.7 m: 50 % stiffer than the other elements")
 
 
 def test_bridges_of_unequal_elements_are_compared_by_pattern() -> None:

@@ -172,13 +172,13 @@ def test_the_estimate_is_the_result(outputs: list[Output]) -> None:
 def test_found_as_soon_as_its_data_are_there(crossing_messages: list[Message]) -> None:
     """One second after the exit, not at the end of the recording."""
     one = engine(chosen=REAL)
-    said = [
+    sent = [
         message.log_time_ns * 1e-9 - START_S
         for message in crossing_messages
         for output in one.feed(message.key, message.payload)
         if output.key.stream == "estimate"
     ]
-    assert said == [pytest.approx(6.44 + 1.05, abs=0.11)]
+    assert sent == [pytest.approx(6.44 + 1.05, abs=0.11)]
     assert list(one.finish()) == []
 
 
@@ -235,10 +235,10 @@ def test_what_is_fetched_after_an_outage_is_waited_for() -> None:
     one = engine()
     gnss = [m for m in messages_of(run) if m.key.stream == "gnss"]
     accel = [m for m in messages_of(run) if m.key.stream == "accel"]
-    said = [o for m in gnss[:400] + accel for o in one.feed(m.key, m.payload)]
-    assert [state.state for state in states_in(said)] == [pb.DETECTED]
-    said += list(one.feed(gnss[400].key, gnss[400].payload))
-    (crossing,) = results_in(said)
+    sent = [o for m in gnss[:400] + accel for o in one.feed(m.key, m.payload)]
+    assert [state.state for state in states_in(sent)] == [pb.DETECTED]
+    sent += list(one.feed(gnss[400].key, gnss[400].payload))
+    (crossing,) = results_in(sent)
     assert "gap_on_bridge" not in crossing.reasons
     assert "channel_missing" not in crossing.reasons
 

@@ -26,7 +26,7 @@ from tests.unit.identification.test_engine_resume import (
     WHOLE,
     EngineOutput,
     messages_of,
-    said_by,
+    output_of,
 )
 
 PAIR = VehicleBridgePair("truck-1", "bridge-1")
@@ -57,12 +57,12 @@ class Asking:
         return [o for m in messages for o in self.published(self.engine.feed(m.key, m.payload))]
 
     def published(
-        self, said: Iterable[Output | IdentificationTask | ValidationRequest]
+        self, sent: Iterable[Output | IdentificationTask | ValidationRequest]
     ) -> list[Output]:
-        return list(dispatch(self.engine, self.here, said, self.wanted.append))
+        return list(dispatch(self.engine, self.here, sent, self.wanted.append))
 
-    def resumed(self, said: EngineOutput) -> list[Output]:
-        return self.published(self.engine.resume(known(said)))
+    def resumed(self, sent: EngineOutput) -> list[Output]:
+        return self.published(self.engine.resume(known(sent)))
 
     def released(self) -> list[Output]:
         found = []
@@ -219,7 +219,7 @@ def test_results_wait_for_room_and_delay_no_process() -> None:
     assert asking.wanted == []
     assert asking.engine.has_released
     outputs += asking.released()
-    assert sorted(said_by(outputs)) == sorted(said_by(Asking({PAIR: DIGEST}).fed(TWO)))
+    assert sorted(output_of(outputs)) == sorted(output_of(Asking({PAIR: DIGEST}).fed(TWO)))
 
 
 @pytest.mark.parametrize("number", range(7))
@@ -227,9 +227,9 @@ def test_a_run_that_was_cut_off_while_they_waited_goes_on(number: int) -> None:
     """Whatever was published of them before: no state is published twice, none is left out."""
     before = Asking().fed(TWO)[:number]
     asking = Asking()
-    asking.resumed(said_by(before))
+    asking.resumed(output_of(before))
     again = asking.fed(TWO)
-    assert said_by(before) + said_by(again) == said_by(Asking().fed(TWO))
+    assert output_of(before) + output_of(again) == output_of(Asking().fed(TWO))
     assert asking.wanted == [PAIR]
     asking.engine.certify(PAIR, DIGEST)
     assert names(asking.released()) == of_one(ONE, *GOES_ON) + of_one(OTHER, *GOES_ON)
@@ -247,12 +247,12 @@ def test_a_run_that_was_cut_off_while_they_went_on_goes_on(number: int) -> None:
 
     before = whole()[: 6 + number]
     asking = Asking({PAIR: DIGEST})
-    after = [*asking.resumed(said_by(before)), *asking.fed(TWO)]
-    assert sorted(said_by(before) + said_by(after)) == sorted(said_by(whole()))
+    after = [*asking.resumed(output_of(before)), *asking.fed(TWO)]
+    assert sorted(output_of(before) + output_of(after)) == sorted(output_of(whole()))
 
 
-def known(said: EngineOutput) -> list[CrossingRecord]:
-    return known_crossings(said, search_hash(HEADER))
+def known(sent: EngineOutput) -> list[CrossingRecord]:
+    return known_crossings(sent, search_hash(HEADER))
 
 
 def test_overdue_crossings_are_reported_as_given_up(

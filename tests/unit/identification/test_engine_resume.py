@@ -81,18 +81,18 @@ def until(time_s: float) -> list[Message]:
     return [m for m in TWO if m.log_time_ns * 1e-9 - START_S < time_s]
 
 
-def said_by(outputs: Iterable[Output]) -> EngineOutput:
+def output_of(outputs: Iterable[Output]) -> EngineOutput:
     return [(output.key, output.payload) for output in outputs]
 
 
 def resumed(
-    said: EngineOutput,
+    sent: EngineOutput,
     messages: Iterable[Message],
     counted: Identifications | None = None,
     header: ResultHeader = HEADER,
 ) -> list[Output]:
     one = engine(counted, header)
-    return [*one.resume(said), *fed(one, messages), *one.finish()]
+    return [*one.resume(sent), *fed(one, messages), *one.finish()]
 
 
 def states(outputs: Iterable[Output]) -> list[pb.Crossing]:
@@ -118,23 +118,23 @@ def test_two_crossings_are_twelve_messages() -> None:
 def test_wherever_a_run_is_cut_off_the_next_says_the_rest(number: int) -> None:
     """Byte for byte, and in the same order; only what has no result is identified again."""
     counted = Identifications()
-    before = said_by(WHOLE[:number])
+    before = output_of(WHOLE[:number])
     after = resumed(before, TWO, counted)
-    assert before + said_by(after) == said_by(WHOLE)
+    assert before + output_of(after) == output_of(WHOLE)
     assert counted.made == sum(output.result is not None for output in WHOLE[number:])
 
 
 @pytest.mark.parametrize("numbers", [(2, 5), (4, 9), (5, 6), (3, 3)])
 def test_a_run_may_be_cut_off_twice(numbers: tuple[int, int]) -> None:
     first, second = numbers
-    said = said_by(WHOLE[:first])
-    said += said_by(resumed(said, TWO))[: second - first]
-    assert said + said_by(resumed(said, TWO)) == said_by(WHOLE)
+    sent = output_of(WHOLE[:first])
+    sent += output_of(resumed(sent, TWO))[: second - first]
+    assert sent + output_of(resumed(sent, TWO)) == output_of(WHOLE)
 
 
 def test_earlier_crossings_count_in_the_next_state() -> None:
     """The truck has gone meanwhile and nothing of the first crossing comes again."""
-    after = resumed(said_by(WHOLE[:6]), [m for m in TWO if m.log_time_ns * 1e-9 > START_S + 25.0])
+    after = resumed(output_of(WHOLE[:6]), [m for m in TWO if m.log_time_ns * 1e-9 > START_S + 25.0])
     assert [s.SerializeToString() for s in bridge_states(after)] == [WHOLE[11].payload]
     (state,) = bridge_states(after)
     first = WHOLE[3].result
@@ -158,11 +158,11 @@ def test_results_file_has_the_published_state() -> None:
 
 
 def fuses_of(
-    run: Engine, said: Iterable[Output | IdentificationTask | FusionTask | ValidationRequest]
+    run: Engine, sent: Iterable[Output | IdentificationTask | FusionTask | ValidationRequest]
 ) -> list[FusionTask]:
     """What is to be fused when the works of a run are done; their states are published later."""
     found = []
-    for one in said:
+    for one in sent:
         if isinstance(one, IdentificationTask):
             result = Identifications()(one.data, SETTINGS, stopwatch=lambda: 0.0)
             found += fuses_of(run, run.done(one, result))
@@ -184,15 +184,15 @@ def test_a_state_that_was_made_before_a_result_does_not_count_it() -> None:
     outputs = [o for o in WHOLE if o.key.stream != "state"]
     outputs += one.fused(first, state_made_of(first))
     assert one.bridges() == {"bridge-1": state_made_of(first)}
-    (again,) = resumed(said_by(outputs), [])
+    (again,) = resumed(output_of(outputs), [])
     assert again.payload == WHOLE[11].payload
     outputs += one.fused(second, state_made_of(second))
-    assert resumed(said_by(outputs), []) == []
+    assert resumed(output_of(outputs), []) == []
 
 
 def test_next_run_publishes_one_state_of_several_results() -> None:
     outputs = [o for o in WHOLE if o.key.stream != "state"]
-    assert [o.payload for o in resumed(said_by(outputs), [])] == [WHOLE[11].payload]
+    assert [o.payload for o in resumed(output_of(outputs), [])] == [WHOLE[11].payload]
 
 
 def test_crossings_that_could_not_be_fused_are_a_warning_and_owed(
@@ -209,7 +209,7 @@ def test_crossings_that_could_not_be_fused_are_a_warning_and_owed(
 def test_new_run_has_the_published_states() -> None:
     """Nothing is fused for them once more."""
     published = state_to_bridge(bridge_states(WHOLE)[-1])[2]
-    known = known_crossings(said_by(WHOLE), search_hash(HEADER))
+    known = known_crossings(output_of(WHOLE), search_hash(HEADER))
     one = Engine(SITE, SETTINGS, HEADER)
     assert (
         list(one.resume(known, {(REALM, "bridge-1"): published, (REALM, "other"): published})) == []
@@ -226,13 +226,13 @@ def test_a_history_that_begins_on_the_bridge_is_no_second_crossing(begin_s: floa
     """The truck's cache goes back to the middle of the bridge only."""
     rest = messages_of(*SLOW, begin_s=begin_s)
     assert fed_all_alone(rest)  # there is something to be mistaken
-    assert resumed(said_by(fed_all_alone(messages_of(*SLOW))), rest) == []
+    assert resumed(output_of(fed_all_alone(messages_of(*SLOW))), rest) == []
 
 
 @pytest.mark.parametrize("published", [1, 3])
 def test_published_half_crossing_keeps_its_name(published: int) -> None:
     whole = fed_all_alone(messages_of(*SLOW))
-    after = resumed(said_by(whole[:published]), messages_of(*SLOW, begin_s=17.0))
+    after = resumed(output_of(whole[:published]), messages_of(*SLOW, begin_s=17.0))
     assert len([o for o in after if o.result]) == 1
     assert {state.crossing_id for state in states(after)} == {states(whole)[0].crossing_id}
     assert [s.state for s in states(whole[:published] + after)] == [1, 2, 4, 5]
@@ -247,7 +247,7 @@ def fed_all_alone(messages: list[Message]) -> list[Output]:
 def test_a_result_of_another_search_does_not_count(change: str) -> None:
     other = {"settings": {"method": "pre"}, "site_hash": "other", "seed": 7}[change]
     header = HEADER._replace(**{change: other})
-    after = resumed(said_by(WHOLE), TWO, header=header)
+    after = resumed(output_of(WHOLE), TWO, header=header)
     assert [s.state for s in states(after)] == [s.state for s in states(WHOLE)]
     assert [s.crossing_id for s in states(after)] == [s.crossing_id for s in states(WHOLE)]
     assert [list(s.crossings_used) for s in bridge_states(after)] == [
@@ -258,21 +258,21 @@ def test_a_result_of_another_search_does_not_count(change: str) -> None:
 @pytest.mark.parametrize("number", [4, 5])
 def test_a_run_cut_off_after_one_of_another_search(number: int) -> None:
     """That one published a `done` and a state of the bridge, too: of its own result."""
-    other = said_by(fed(engine(header=HEADER._replace(settings={"method": "pre"})), TWO)[:6])
+    other = output_of(fed(engine(header=HEADER._replace(settings={"method": "pre"})), TWO)[:6])
     whole = resumed(other, TWO)
-    after = resumed(other + said_by(whole[:number]), TWO)
-    assert said_by(after) == said_by(whole[number:])
+    after = resumed(other + output_of(whole[:number]), TWO)
+    assert output_of(after) == output_of(whole[number:])
 
 
 def test_another_version_of_the_program_does_not_identify_anew() -> None:
-    assert resumed(said_by(WHOLE), TWO, header=HEADER._replace(version="99", created=5.0)) == []
+    assert resumed(output_of(WHOLE), TWO, header=HEADER._replace(version="99", created=5.0)) == []
 
 
 def test_another_truck_bridge_or_realm_is_another_crossing() -> None:
     for old, new in (("truck-1", "truck-2"), ("bridge-1", "bridge-2"), (REALM, "live")):
         changed = [
             (Key(*(new if part == old else part for part in key)), payload)
-            for key, payload in said_by(WHOLE[:6])
+            for key, payload in output_of(WHOLE[:6])
         ]
         if old == "truck-1":  # not in a key of a bridge
             changed = [(key, of_truck(payload, new)) for key, payload in changed if is_state(key)]
@@ -302,8 +302,8 @@ def test_what_is_malformed_is_left_out() -> None:
         for stream in ("crossing", "estimate", "state")
         for payload in (b"\xff\xff", b"\x08\x09", b"")
     ]
-    said = said_by(WHOLE[:6])
-    assert resumed([*broken, *said, *broken], TWO) == WHOLE[6:]
+    sent = output_of(WHOLE[:6])
+    assert resumed([*broken, *sent, *broken], TWO) == WHOLE[6:]
 
 
 def without(messages: list[Message], stream: str, begin_s: float, stop_s: float) -> list[Message]:

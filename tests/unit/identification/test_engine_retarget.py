@@ -82,8 +82,8 @@ def test_crossings_that_wait_are_those_of_the_new_file() -> None:
     seen = []
     one.engine.certify(PAIR, DIGEST)
     while one.engine.has_released:
-        said = list(one.engine.release())
-        seen += [one for one in said if not isinstance(one, (Output, ValidationRequest))]
+        output = list(one.engine.release())
+        seen += [one for one in output if not isinstance(one, (Output, ValidationRequest))]
     assert [(work.data.vehicle, work.data.bridge) for work in seen] == [
         (EDITED.vehicles[0], EDITED.bridges[1])
     ] * 2

@@ -259,9 +259,9 @@ def test_the_command_fuses_files(tmp_path: Path, capsys: pytest.CaptureFixture[s
     other = write(tmp_path / "other.json", [crossing(n) for n in range(2, 5)])
     out = tmp_path / "out.json"
     assert main(["fuse", str(one), str(other), "--json", str(out)]) == 0
-    said = capsys.readouterr().out
-    assert "bridge-1, 5 crossings together" in said
-    assert "measurement good" in said
+    output = capsys.readouterr().out
+    assert "bridge-1, 5 crossings together" in output
+    assert "measurement good" in output
     found = load_results(out)
     assert len(found.crossings) == 5
     assert len(found.bridges["bridge-1"].crossings_used) == 5

@@ -142,13 +142,13 @@ def test_the_command_writes_it_and_spoils_nothing(
     assert cli.main(["check", "--template", str(new)]) == 2
     assert "exists" in capsys.readouterr().err
     assert cli.main(["check", str(new)]) == 2
-    said = capsys.readouterr()
-    lines = [line for line in said.out.splitlines() if line.startswith("  wrong  ")]
+    output = capsys.readouterr()
+    lines = [line for line in output.out.splitlines() if line.startswith("  wrong  ")]
     assert lines[0].startswith(
         "  wrong  vehicle.total_mass_kg is NaN (not filled in), it must be a mass"
     )
-    assert said.err.endswith(f"{new}: {len(lines)} values are wrong; nothing else was checked\n")
-    assert said.err.count("\n") == 1
+    assert output.err.endswith(f"{new}: {len(lines)} values are wrong; nothing else was checked\n")
+    assert output.err.count("\n") == 1
     assert len(lines) == len(NEEDED.findall(TEMPLATE))
     assert cli.main(["check", str(new), "--json"]) == 2
     (report,) = json.loads(capsys.readouterr().out)["reports"]

@@ -119,9 +119,9 @@ def test_one_and_two_threads_are_one_search() -> None:
     assert search_hash(header(starts=1)) != search_hash(header(starts=2))
     messages = messages_of(*THROUGH)
     published = published_by_worker(messages, SITE)
-    said = [(m.key, m.payload) for m in published]
+    output = [(m.key, m.payload) for m in published]
     for threads in (1, 2, 7):
-        (known,) = known_crossings(said, search_hash(header(threads=threads)))
+        (known,) = known_crossings(output, search_hash(header(threads=threads)))
         assert known.is_identified
-    (other,) = known_crossings(said, search_hash(header(starts=7)))
+    (other,) = known_crossings(output, search_hash(header(starts=7)))
     assert not other.is_identified

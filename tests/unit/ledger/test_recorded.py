@@ -30,7 +30,7 @@ from tests.unit.identification.test_engine_resume import (
     START_S,
     TWO,
     WHOLE,
-    said_by,
+    output_of,
 )
 
 Files = tuple[Path, ...]
@@ -60,14 +60,14 @@ def looked(files: Files) -> list[RecordedStay]:
 def taken(
     files: Files, stays: list[RecordedStay], *, is_final: bool = False, published: int = 0
 ) -> FetchResult:
-    known = known_crossings(said_by(WHOLE[:published]))
+    known = known_crossings(output_of(WHOLE[:published]))
     return fetch_crossings(files, REALM, stays, known, SITE, SETTINGS, is_final=is_final)
 
 
 def live() -> list[IdentificationTask]:
     engine = Engine(SITE, SETTINGS, HEADER)
-    said = (one for m in TWO for one in engine.feed(m.key, m.payload))
-    return [one for one in said if isinstance(one, IdentificationTask)]
+    sent = (one for m in TWO for one in engine.feed(m.key, m.payload))
+    return [one for one in sent if isinstance(one, IdentificationTask)]
 
 
 def same_data(one: IdentificationTask, other: IdentificationTask) -> None:
@@ -184,7 +184,7 @@ def test_accelerations_far_from_bridges_are_not_held(
 
 
 def test_ledger_knows_results_of_earlier_runs_and_this_one() -> None:
-    ledger = Ledger(known_crossings(said_by(WHOLE[:3])), 100.0)
+    ledger = Ledger(known_crossings(output_of(WHOLE[:3])), 100.0)
     whose = (REALM, "truck-1", "bridge-1")
     (one,) = ledger.about(*whose)
     assert not one.is_identified

@@ -398,10 +398,10 @@ def test_endless_answers_are_read_once_and_complained_of_a_few_times(
     assert sum(rounds) > 2000
     assert decoded.count(contents) <= len(rounds)
     logger.recovery.close()
-    said = [r.getMessage() for r in caplog.records if "spool contents" in r.getMessage()]
-    assert 0 < len(said) <= 6
-    assert "truck-1 answers more than once for accel" in said[0]
-    assert "more warnings of this kind" in said[-1]
+    output = [r.getMessage() for r in caplog.records if "spool contents" in r.getMessage()]
+    assert 0 < len(output) <= 6
+    assert "truck-1 answers more than once for accel" in output[0]
+    assert "more warnings of this kind" in output[-1]
     gateway.close()
     end()
 

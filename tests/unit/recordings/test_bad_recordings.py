@@ -87,7 +87,7 @@ def driven(path: Path) -> None:
 
 @pytest.mark.parametrize("command", [replayed, driven])
 @pytest.mark.parametrize(
-    ("payload", "said"),
+    ("payload", "output"),
     [
         (too_large, "accel: 7200042 bytes; at most 262144"),
         (millions_of_channels, "bytes; at most 262144"),
@@ -96,13 +96,13 @@ def driven(path: Path) -> None:
     ],
 )
 def test_a_message_that_no_logger_takes_is_named(
-    tmp_path: Path, command: Callable[[Path], None], payload: Callable[[], bytes], said: str
+    tmp_path: Path, command: Callable[[Path], None], payload: Callable[[], bytes], output: str
 ) -> None:
     path = recording(tmp_path / "bad.mcap", payload())
     with pytest.raises(InputError) as caught:
         command(path)
     assert str(caught.value).startswith(f"{path}: message 1 of truck-1: vehicle/")
-    assert said in str(caught.value)
+    assert output in str(caught.value)
 
 
 @pytest.mark.parametrize("command", [replayed, driven])

@@ -249,8 +249,8 @@ def test_what_single_crossings_say_of_a_weak_element_shows_how_far_they_scatter(
     third = results_of(site, some_crossing("c", verdict="suspect", reasons=("position_outage",)))
     everything = one.crossings + other.crossings + third.crossings
     merged = other.model_copy(update={"crossings": everything})
-    said = "From each of the 2 good crossings alone, element 4 is 50 to 60 % less stiff; the"
-    assert said in reported(site, merged).text
+    output = "From each of the 2 good crossings alone, element 4 is 50 to 60 % less stiff; the"
+    assert output in reported(site, merged).text
     assert "crossings alone" not in reported(site, one).text
 
 
@@ -385,9 +385,11 @@ def test_the_command_writes_the_page_and_says_the_finding(
 ) -> None:
     found, site = written
     out = tmp_path / "r.html"
-    code, said, err = run(capsys, "report", found, "--site", site, "-o", out)
+    code, output, err = run(capsys, "report", found, "--site", site, "-o", out)
     assert (code, err) == (0, "")
-    assert said.startswith("bridge-1: One element is clearly less stiff. Element 4, 12.9 to 17.1 m")
+    assert output.startswith(
+        "bridge-1: One element is clearly less stiff. Element 4, 12.9 to 17.1 m"
+    )
     assert "Element 4" in Seen(out.read_text()).text
     first = out.read_bytes()
     assert run(capsys, "report", found, "--site", site, "-o", out)[0] == 0
@@ -457,8 +459,8 @@ def test_what_cannot_be_reported_is_one_line_and_leaves_nothing(
         ((changed("e", {"bridge": "b-9"}), *with_site), "has results of b-9, which"),
     ):
         out = () if "-o" in arguments else ("-o", tmp_path / "r.html")
-        code, said, err = run(capsys, "report", *arguments, *out)
-        assert (code, said) == (2, ""), words
+        code, output, err = run(capsys, "report", *arguments, *out)
+        assert (code, output) == (2, ""), words
         assert words in err.splitlines()[-1]
         assert not (tmp_path / "r.html").exists()
 
@@ -798,10 +800,10 @@ def test_the_words_that_are_used_are_explained_and_no_others(site: Site) -> None
 def test_of_a_rejected_crossing_stands_what_to_do_next(site: Site) -> None:
     rejected = some_crossing("a", verdict="rejected", reasons=("channel_swapped",))
     content = results_of(site, rejected).model_dump(mode="json")
-    said = "Two channels seem to be swapped: sprung_front and sprung_rear."
-    content["crossings"][0]["reason_texts"] = [said]
+    output = "Two channels seem to be swapped: sprung_front and sprung_rear."
+    content["crossings"][0]["reason_texts"] = [output]
     text = reported(site, Results.model_validate(content)).text
-    assert f"there are no usable values. {said}" in text
+    assert f"there are no usable values. {output}" in text
     what = text.partition("What to do next")[2].partition("What this does not mean")[0]
     assert "Check the wiring of these sensors." in what
     assert "drive the truck for a minute on any road and run driveby check REC" in what

@@ -65,14 +65,14 @@ def test_impossible_values_are_named_with_their_range(key: str, value: str, line
 )
 def test_a_receiver_errs_by_less_than_a_bridge(key: str, most: str) -> None:
     assert f"receiver.{key} is 1e+06, it must be a " in (
-        said := complaint(f"{RECEIVER}{key} = 1e6")
+        output := complaint(f"{RECEIVER}{key} = 1e6")
     )
-    assert f"from 0 to {most}" in said
+    assert f"from 0 to {most}" in output
 
 
 def test_the_range_says_what_it_follows_from() -> None:
-    said = complaint(with_line("flexural_rigidity_nm2", "8.5e6"))
-    assert said == (
+    output = complaint(with_line("flexural_rigidity_nm2", "8.5e6"))
+    assert output == (
         "bridge.flexural_rigidity_nm2 is 8.5e+06, it must be a flexural rigidity from 4.086e+07 to "
         "3.6e+12 N·m²: 20 m of 4000 kg/m swing at 0.4 to 118 Hz; in kN·m²? then it is 8.5e+09"
     )

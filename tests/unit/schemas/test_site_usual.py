@@ -85,10 +85,10 @@ def test_other_unit_is_an_error_or_a_warning_that_names_it(
     table: str, key: str, factor: float, words: str
 ) -> None:
     try:
-        said = warnings_of(parse_site(scaled(table, key, factor), "site.toml"))
+        output = warnings_of(parse_site(scaled(table, key, factor), "site.toml"))
     except InputError as error:
-        said = [str(error)]
-    assert any(key in line and words in line for line in said), said
+        output = [str(error)]
+    assert any(key in line and words in line for line in output), output
 
 
 def test_damping_ratio_for_a_coefficient_is_named() -> None:
@@ -144,10 +144,10 @@ def test_likely_slip_is_named(changes: dict[str, str], words: str) -> None:
         begin = text.index(f"\n{key} = ") + 1
         text = f"{text[:begin]}{key} = {value}{text[text.index(chr(10), begin) :]}"
     try:
-        said = warnings_of(parse_site(text, "site.toml"))
+        output = warnings_of(parse_site(text, "site.toml"))
     except InputError as error:
-        said = [str(error)]
-    assert any(words in line for line in said), said
+        output = [str(error)]
+    assert any(words in line for line in output), output
 
 
 def test_swapped_coordinates_of_the_ends_are_named() -> None:

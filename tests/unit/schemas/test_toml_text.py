@@ -35,7 +35,7 @@ def complaint(text: str) -> str:
 
 @pytest.mark.usefixtures("unparsed")
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "output"),
     [
         (".".join(["a"] * 30_000) + " = 1", "line 1: a key is more than 8 deep"),
         ("\n[" + " . ".join(["a"] * 9) + "]", "line 2: a key is more than 8 deep"),
@@ -54,8 +54,8 @@ def complaint(text: str) -> str:
         ("#" + "ü" * (MAX_BYTES // 2), "is larger than 16 MiB"),
     ],
 )
-def test_what_costs_too_much_is_refused_unparsed(text: str, said: str) -> None:
-    assert said in complaint(text)
+def test_what_costs_too_much_is_refused_unparsed(text: str, output: str) -> None:
+    assert output in complaint(text)
 
 
 @pytest.mark.parametrize(
@@ -124,8 +124,8 @@ def test_no_string_or_comment_hides_a_deep_key_from_the_check(before: str, after
 
 def test_a_string_that_never_ends_is_gone_through_once() -> None:
     """Every third character could begin a string: none of them may read on to the end again."""
-    said = complaint('x = """' + '\\"""' * 400_000)
-    assert "is not TOML" in said
+    output = complaint('x = """' + '\\"""' * 400_000)
+    assert "is not TOML" in output
     assert "is not TOML" in complaint('x = "' + '\\"' * 400_000)
 
 
@@ -146,8 +146,8 @@ def test_unknown_fields_and_tables_are_not_counted_without_end() -> None:
     assert "has 101 fields" in complaint("".join(f"x{n}=1\n" for n in range(101)))
     assert "has 20001 [[bridge]]" in complaint("[[bridge]]\n" * 20_001)
     values = ", ".join(['"x"'] * 101)
-    said = complaint(TEXT.replace("[sensor]", f"element_lengths_m = [{values}]\n[sensor]"))
-    assert "[bridge] element_lengths_m has 101 values" in said
+    output = complaint(TEXT.replace("[sensor]", f"element_lengths_m = [{values}]\n[sensor]"))
+    assert "[bridge] element_lengths_m has 101 values" in output
 
 
 def test_a_file_that_is_too_large_or_none_is_not_read(tmp_path: Path) -> None:
@@ -181,16 +181,16 @@ def test_only_one_place_parses_toml() -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "output"),
     [
         ("span_m = 22,0", "22,0 has a decimal comma, TOML has a point: 22.0"),
         ("  span_m=-1,5e3  # m", "-1,5e3 has a decimal comma, TOML has a point: -1.5e3"),
     ],
 )
-def test_a_decimal_comma_is_named(line: str, said: str) -> None:
+def test_a_decimal_comma_is_named(line: str, output: str) -> None:
     with pytest.raises(InputError) as caught:
         parse_toml(f"[bridge]\nid = 'b'\n{line}\nelements = 5\n", "site.toml")
-    assert str(caught.value) == f"site.toml: line 3: is not TOML: {said}"
+    assert str(caught.value) == f"site.toml: line 3: is not TOML: {output}"
 
 
 def test_a_comma_between_values_is_no_decimal_comma() -> None:

@@ -29,11 +29,11 @@ def test_of_a_site_file_a_truck_says_its_own_part_only() -> None:
         + "[bridge]",
     )
     parse_site(two, "two")  # it is one
-    said = vehicle_part(two, "truck-y")
-    assert "truck-x" not in said
-    assert "bridge" not in said
+    output = vehicle_part(two, "truck-y")
+    assert "truck-x" not in output
+    assert "bridge" not in output
     bridge = TEXT[TEXT.index("[bridge]") : TEXT.index("[sensor]")]
-    assert parse_site(said + bridge, "said").vehicles[0].id == "truck-y"
+    assert parse_site(output + bridge, "said").vehicles[0].id == "truck-y"
     assert parse_site(vehicle_part(TEXT, "truck-x") + bridge, "said") == SITE
 
 
@@ -43,7 +43,7 @@ def test_own_vehicle_text_is_returned_unchanged() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "output"),
     [
         ("", "has no \\[vehicle\\]"),
         (TEXT, "has no \\[vehicle\\] with id"),
@@ -53,8 +53,8 @@ def test_own_vehicle_text_is_returned_unchanged() -> None:
         ('[vehicle]\nid = "other"\ncg_height_m = inf\n[bridge]\n', "is not TOML"),
     ],
 )
-def test_text_without_the_vehicle_gives_one_line(text: str, said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_text_without_the_vehicle_gives_one_line(text: str, output: str) -> None:
+    with pytest.raises(InputError, match=output):
         vehicle_part(text, "other")
 
 
@@ -96,8 +96,8 @@ def test_the_spreads_say_how_much_is_too_much(values: dict[str, object], differs
 
 def test_values_known_exactly_may_still_be_rounded() -> None:
     exact = TRUCK.model_copy(update={"total_mass_kg_spread": 0.0})
-    said = changed(total_mass_kg=9001.0, total_mass_kg_spread=0.0)
-    assert differences(said, exact) == []
+    output = changed(total_mass_kg=9001.0, total_mass_kg_spread=0.0)
+    assert differences(output, exact) == []
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def test_runs_that_are_one_drive_now_are_as_many_crossings() -> None:
     assert [(r.direction, r.verdict) for r in results] == [("start_to_end", "good")] * 2
 
 
-def said(caplog: pytest.LogCaptureFixture, speed: float, *, skip_gaps: bool) -> str:
+def printed(caplog: pytest.LogCaptureFixture, speed: float, *, skip_gaps: bool) -> str:
     caplog.clear()
     with caplog.at_level(logging.INFO):
         _log_timing(_times(TWO_RUNS, speed, skip_gaps=skip_gaps))
@@ -95,7 +95,7 @@ def said(caplog: pytest.LogCaptureFixture, speed: float, *, skip_gaps: bool) -> 
 
 
 def test_waiting_time_is_reported(caplog: pytest.LogCaptureFixture) -> None:
-    text = said(caplog, 1.0, skip_gaps=False)
+    text = printed(caplog, 1.0, skip_gaps=False)
     assert (
         "nothing was recorded for up to 600 s (between runs): of the 603 s that the drive takes, "
         "600 s are spent waiting; --skip-gaps skips them" in text
@@ -104,7 +104,7 @@ def test_waiting_time_is_reported(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_times_of_long_ago_are_explained(caplog: pytest.LogCaptureFixture) -> None:
-    text = said(caplog, 1.0, skip_gaps=True)
+    text = printed(caplog, 1.0, skip_gaps=True)
     assert "waiting" not in text
     found = re.search(r"it begins at (\S+ \S+) UTC, its first samples are 600 s old", text)
     assert found

@@ -106,14 +106,14 @@ def test_what_was_appended_survives_kill_9(tmp_path: Path) -> None:
         [sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True
     )
     assert process.stdout is not None
-    while (said := int(process.stdout.readline())) < 3000:
+    while (output := int(process.stdout.readline())) < 3000:
         pass
     os.kill(process.pid, signal.SIGKILL)
     rest, _ = process.communicate()
-    said = max([said, *(int(line) for line in rest.split("\n")[:-1])])
+    output = max([output, *(int(line) for line in rest.split("\n")[:-1])])
     spool = Spool(tmp_path)
     [boot] = spool.contents("accel")
-    assert boot.next_sequence in (said, said + 1)
+    assert boot.next_sequence in (output, output + 1)
     assert boot.held == [(0, boot.next_sequence - 1)]
     assert sequences(spool, boot.boot_id) == list(range(boot.next_sequence))
     spool.close()

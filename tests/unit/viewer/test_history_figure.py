@@ -52,34 +52,34 @@ def test_the_newest_estimate_is_in_its_panel_however_few_are_like_it() -> None:
 
 def test_the_head_says_what_to_do_while_an_alarm_stands() -> None:
     points = weeks(*[1.0] * 150, 0.9, 0.9, 0.9)
-    said = [
+    output = [
         text.get_text() for text in drawn(HistoryView("b-1", "week", points, (mark(),), ())).texts
     ]
-    assert "ALARM: element 2 is weaker" in said
+    assert "ALARM: element 2 is weaker" in output
     assert (
         "Inspect the bridge, then acknowledge the alarm: driveby alarm ack b-1 --by NAME "
-        "--note TEXT" in said
+        "--note TEXT" in output
     )
     noted = mark("the owner, 2025-06-23", "props were put in")
-    said = [
+    output = [
         text.get_text() for text in drawn(HistoryView("b-1", "week", points, (noted,), ())).texts
     ]
-    assert "acknowledged: element 2 is weaker (the owner, 2025-06-23)" in said
-    assert "“props were put in”" in said
-    assert not any("driveby" in text for text in said)
+    assert "acknowledged: element 2 is weaker (the owner, 2025-06-23)" in output
+    assert "“props were put in”" in output
+    assert not any("driveby" in text for text in output)
     long = mark("the owner, 2025-06-23", "x" * 500)
-    said = [
+    output = [
         text.get_text() for text in drawn(HistoryView("b-1", "week", points, (long,), ())).texts
     ]
-    assert max(map(len, said)) < 110
+    assert max(map(len, output)) < 110
 
 
 def test_the_head_is_green_only_where_a_watch_found_nothing() -> None:
     points = weeks(1.0, 0.8)
     for is_reassuring in (True, False):
         long = " ".join(["not watched"] * 20)
-        said = (Statement(long, is_reassuring),)
-        texts = drawn(HistoryView("b-1", "week", points, (), said)).texts
+        output = (Statement(long, is_reassuring),)
+        texts = drawn(HistoryView("b-1", "week", points, (), output)).texts
         about = [text for text in texts if "not watched" in text.get_text()]
         assert len(about) == 3
         assert " ".join(text.get_text() for text in about) == long

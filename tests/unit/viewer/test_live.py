@@ -197,7 +197,7 @@ def test_nothing_for_all_times_but_looks(live: Live, site: Site) -> None:
     live.hears("bridge", "estimate", estimate(result(site)))
     before = {c.entity_path for c in made_static(live)}
     assert "/latest/bridge-1/strip/density" not in before
-    assert not any(path.startswith(("/latest", "/said", "/map/track")) for path in before)
+    assert not any(path.startswith(("/latest", "/newest", "/map/track")) for path in before)
 
 
 def made_static(live: Live) -> list[Chunk]:
@@ -215,8 +215,8 @@ def test_the_states_of_a_crossing_last_as_long_as_they_did(live: Live, site: Sit
     live.clock[0] += 3.0
     chunks = live.drawn()
     lane = rows(chunks, "crossings/bridge-1/truck-1")
-    said = values(lane, "StateChange:state")
-    assert said == ["on the bridge", "complete", "identifying", "good"]
+    output = values(lane, "StateChange:state")
+    assert output == ["on the bridge", "complete", "identifying", "good"]
     newest_s = 4.95
     assert times_s(lane) == pytest.approx([0.0, 4.0, newest_s, newest_s + 7.0], abs=1e-6)
     # Time goes on, so that the last state is seen.
@@ -252,7 +252,7 @@ def test_a_result_is_drawn_and_the_next_takes_its_place(live: Live, site: Site) 
     cleared = times_s(rows(chunks, "latest/bridge-1"))
     assert cleared == pytest.approx([4.0, 64.0], abs=1e-5)
     assert all(clear < drawn for clear, drawn in zip(cleared, (4.0, 64.0), strict=True))
-    texts = values(rows(chunks, "said/bridge-1"), "TextDocument:text")
+    texts = values(rows(chunks, "newest/bridge-1"), "TextDocument:text")
     assert "No result yet" in texts[0]
     assert "60 % less stiff than the other elements" in texts[1]
     assert "No element differs clearly from the others" in texts[2]
@@ -266,7 +266,7 @@ def test_unresolved_elements_of_a_result_are_not_said_to_be_alike(live: Live, si
     level = {"unit": "1", "mean": 0.97, "std": 0.1, "q025": 0.8, "q50": 0.97, "q975": 1.2}
     content["derived"] |= {"ei_level": level}
     live.hears("bridge", "estimate", estimate(CrossingResult.model_validate(content)))
-    text = values(rows(live.drawn(), "said/bridge-1"), "TextDocument:text")[-1]
+    text = values(rows(live.drawn(), "newest/bridge-1"), "TextDocument:text")[-1]
     assert "2 of 7 elements not resolved" in text
     assert "differs clearly" not in text
 
@@ -280,7 +280,7 @@ def test_rejected_crossing_names_reason_and_source_of_numbers(live: Live, site: 
     chunks = live.drawn()
     for drawn in ("density", "ratio", "road/rear"):
         assert times_s(rows(chunks, f"latest/bridge-1/strip/{drawn}")) == [4.0]
-    first, _, last = values(rows(chunks, "said/bridge-1"), "TextDocument:text")[1:]
+    first, _, last = values(rows(chunks, "newest/bridge-1"), "TextDocument:text")[1:]
     for text in (first, last):
         assert text.startswith("### Rejected: truck-1 → bridge-1\n")
         assert bad.reason_texts[0] in text
@@ -316,7 +316,7 @@ def test_an_alarm_heads_the_text_of_its_bridge_while_it_stands(live: Live, site:
         "(95 % interval 8 to 12 %).**"
     )
     raised = f"{heads} Raised 2026-09-20, not acknowledged.\n\n"
-    texts = values(rows(chunks, "said/bridge-1"), "TextDocument:text")
+    texts = values(rows(chunks, "newest/bridge-1"), "TextDocument:text")
     assert "No result yet" in texts[0]
     assert [text.startswith(raised) for text in texts] == [True, True, False, True]
     assert all("60 % less stiff than the other" in text for text in texts[1:])
@@ -370,7 +370,7 @@ def test_what_cannot_be_read_is_left_out(live: Live) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "output"),
     [
         (["--listen", "localhost"], "--listen localhost: is not an IPv4 address"),
         (["--realm", "monday"], "realm 'monday' must be live"),
@@ -380,11 +380,11 @@ def test_what_cannot_be_read_is_left_out(live: Live) -> None:
     ],
 )
 def test_bad_options_are_one_line(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], output: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["view", "live", "--serve", *arguments]) == 2
     err = capsys.readouterr().err
-    assert said in err
+    assert output in err
     assert err.count("\n") == 1
 
 

@@ -208,11 +208,11 @@ def test_a_good_crossing_says_what_is_weak_and_by_how_much(site: Site) -> None:
     assert "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements" in text
     assert_words_apart(figure)
     sound = results_of(site, some_crossing("a"), ratios=np.ones(7)).crossings[0]
-    said = written(
+    output = written(
         draw_crossing(view_of_crossing(sound, site.bridges[0]), element_truth=None, road_truth=None)
     )
-    assert "% less" not in said
-    assert ENGLISH.text("all.others", within=1, loss=0).partition(" 0 %")[0] in said
+    assert "% less" not in output
+    assert ENGLISH.text("all.others", within=1, loss=0).partition(" 0 %")[0] in output
 
 
 def test_what_is_not_resolved_is_an_empty_bar_and_agrees_with_nothing(site: Site) -> None:

@@ -46,9 +46,9 @@ class Browser:
             asked["sessionId"] = session
         os.write(self._commands, json.dumps(asked).encode() + b"\0")
         while True:  # what is no answer is an event
-            said = json.loads(self._message())
-            if said.get("id") == self._last:
-                return dict(said.get("result", {}))
+            output = json.loads(self._message())
+            if output.get("id") == self._last:
+                return dict(output.get("result", {}))
 
     def open(self, address: str) -> None:
         self.ask("Page.navigate", self._session, url=address)
@@ -84,8 +84,8 @@ def browser(folder: Path) -> Iterator[Browser]:
         os.close(commands[0])
         os.close(answers[1])
         try:
-            with os.fdopen(answers[0], "rb") as said:
-                yield Browser(commands[1], said)
+            with os.fdopen(answers[0], "rb") as output:
+                yield Browser(commands[1], output)
         finally:
             process.terminate()
             os.close(commands[1])
@@ -98,8 +98,8 @@ def served(file: Path, folder: Path) -> Iterator[str]:
     own = {**os.environ, "HOME": str(folder), "BROWSER": "true", "NO_COLOR": "1"}
     command = [sys.executable, "-m", "driveby", "view", str(file), "--web"]
     log = folder / "viewer.log"
-    with log.open("wb") as said:
-        process = subprocess.Popen(command, env=own, stdout=said, stderr=said)
+    with log.open("wb") as output:
+        process = subprocess.Popen(command, env=own, stdout=output, stderr=output)
     try:
         address = re.compile(r"connect at (http://127\.0\.0\.1:\S+)")
         until(lambda: address.search(log.read_text()) or process.poll() is not None)

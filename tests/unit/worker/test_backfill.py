@@ -35,7 +35,7 @@ from tests.unit.identification.test_engine_resume import (
     TWO,
     WHOLE,
     EngineOutput,
-    said_by,
+    output_of,
     until,
 )
 
@@ -69,8 +69,8 @@ class Reader:
 class Worker:
     """What a worker does with what it finds, without a bus."""
 
-    def __init__(self, folder: Path, said: EngineOutput = (), **engine: object) -> None:  # type: ignore[assignment]
-        known = known_crossings(said, search_hash(HEADER))
+    def __init__(self, folder: Path, sent: EngineOutput = (), **engine: object) -> None:  # type: ignore[assignment]
+        known = known_crossings(sent, search_hash(HEADER))
         self.engine = Engine(SITE, SETTINGS, HEADER, **engine)  # type: ignore[arg-type]
         self.ledger = Ledger(known, time.time())
         self.recorded: set[str] = set()
@@ -92,7 +92,7 @@ class Worker:
         )
         self.here = InlineExecutor(identify=Identifications(), stopwatch=lambda: 0.0)
         self.wanted: list[VehicleBridgePair] = []
-        self.said: EngineOutput = []
+        self.sent: EngineOutput = []
         self._now_s = 0.0
 
     def feed(self, messages: list[Message]) -> list[CrossingResult]:
@@ -107,17 +107,17 @@ class Worker:
         results = []
         for _ in range(times):
             self._now_s += 20.0
-            said = self.backfill.advance(
+            sent = self.backfill.advance(
                 self.engine, self._now_s, has_room=True, want=self.wanted.append
             )
-            results += self._published(said)
+            results += self._published(sent)
         return results
 
-    def _published(self, said: Iterator[object]) -> list[CrossingResult]:
+    def _published(self, sent: Iterator[object]) -> list[CrossingResult]:
         results = []
-        outputs = dispatch(self.engine, self.here, said, self.wanted.append)  # type: ignore[arg-type]
+        outputs = dispatch(self.engine, self.here, sent, self.wanted.append)  # type: ignore[arg-type]
         for output in (*outputs, *collect(self.engine, self.here)):
-            self.said.append((output.key, output.payload))
+            self.sent.append((output.key, output.payload))
             self.ledger.note(output.key, output.payload)
             if output.result is not None:
                 results.append(output.result)
@@ -158,7 +158,7 @@ def test_what_nobody_sends_any_more_gets_its_result_once(
     record(TWO)
     worker = Worker(tmp_path)
     assert ids(worker.go_on()) == IDS
-    assert sorted(worker.said) == sorted(said_by(WHOLE))  # byte for byte, states too
+    assert sorted(worker.sent) == sorted(output_of(WHOLE))  # byte for byte, states too
     assert worker.backfill.waiting == 0
     assert worker.go_on() == []
 
@@ -168,14 +168,14 @@ def test_wherever_a_run_was_cut_off_the_next_says_the_rest(
     tmp_path: Path, record: Callable[..., Path], number: int
 ) -> None:
     record(TWO)
-    before = said_by(WHOLE[:number])
+    before = output_of(WHOLE[:number])
     worker = Worker(tmp_path, before)
     again = list(worker.engine.resume(()))
     worker.go_on()
-    estimates = [key for key, _ in (*before, *worker.said) if key.stream == "estimate"]
+    estimates = [key for key, _ in (*before, *worker.sent) if key.stream == "estimate"]
     assert again == []
     assert len(estimates) == 2
-    crossing_states = [one for one in (*before, *worker.said) if one[0].stream == "crossing"]
+    crossing_states = [one for one in (*before, *worker.sent) if one[0].stream == "crossing"]
     # What `resume` itself finishes has its own tests.
     assert len(crossing_states) == len(set(crossing_states)) >= 7
 
@@ -185,7 +185,7 @@ def test_what_another_search_has_identified_is_left_alone(
 ) -> None:
     """A site file that is edited never identifies again what has a result."""
     record(TWO)
-    known = known_crossings(said_by(WHOLE[:6]), "another search")
+    known = known_crossings(output_of(WHOLE[:6]), "another search")
     worker = Worker(tmp_path)
     worker.ledger = Ledger(known, time.time())
     worker.backfill._ledger = worker.ledger
@@ -206,10 +206,10 @@ def test_what_the_truck_itself_sends_is_no_second_crossing(
     between = Worker(tmp_path)
     for _ in range(3):
         between._now_s += 20.0
-        said = between.backfill.advance(
+        sent = between.backfill.advance(
             between.engine, between._now_s, has_room=False, want=between.wanted.append
         )
-        assert list(said) == []
+        assert list(sent) == []
     assert len(between.backfill._found) == 2
     assert ids(between.feed(TWO)) == IDS
     assert between.go_on() == []
@@ -283,7 +283,7 @@ def test_without_a_certificate_they_stay_in_the_recording(
     pair = VehicleBridgePair("truck-1", "bridge-1")
     assert worker.wanted == [pair]
     assert worker.backfill.waiting == 2
-    assert worker.said == []
+    assert worker.sent == []
     worker.engine.certify(pair, "0123456789abcdef")
     results = worker.go_on()
     assert ids(results) == IDS
