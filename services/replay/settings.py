@@ -53,7 +53,7 @@ class ReplaySettings:
     )
     skip_gaps: bool = flag("skip gaps of more than 2 s", group="time")
     loop: bool = flag(
-        "repeat without end (loggers and workers take the first pass only)", group="time"
+        "repeat until stopped (loggers and workers use the first pass only)", group="time"
     )
     paused: bool = flag("begin paused; needs a terminal", group="time")
     topics: tuple[str, ...] = opt(

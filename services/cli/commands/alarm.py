@@ -45,7 +45,7 @@ class AlarmOptions:
     )
     bridge: str | None = positional("bridge whose alarm is acknowledged", nargs="?")
     history: Path = history_option()
-    realm: str | None = opt("realm of the bridge, where it is in several")
+    realm: str | None = opt("realm of the bridge, if it is in several")
     by: str | None = opt("with ack: name of the person who acknowledges", metavar="NAME")
     note: str = opt("with ack: finding or action, as a note", default="", metavar="TEXT")
     period: "Unit" = opt(

@@ -20,8 +20,8 @@ class DemoOptions:
         "(default: 25)",
         25.0,
     )
-    live: bool = flag("show it live in the viewer")
-    web: bool = flag("show it live in the browser")
+    live: bool = flag("show the demo live in the viewer")
+    web: bool = flag("show the demo live in the browser")
 
 
 def _demo(asked: DemoOptions) -> int:

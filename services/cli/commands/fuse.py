@@ -19,7 +19,9 @@ from services.common.options import (
 class FuseOptions:
     """Options of `driveby fuse`: results to fuse, and outputs."""
 
-    results: tuple[Path, ...] = positional("results", Path, nargs="+", metavar="RESULTS.json")
+    results: tuple[Path, ...] = positional(
+        "results files to fuse", Path, nargs="+", metavar="RESULTS.json"
+    )
     json: Path | None = output_option(
         "JSON file of all crossings and the fused estimates", "OUT.json", RESULTS
     )

@@ -36,13 +36,13 @@ class HistoryOptions:
     """Results to add, or a bridge to show."""
 
     words: tuple[str, ...] = positional(
-        "bridge to show; or add, followed by results files or folders of identify --into or a "
-        "worker; if omitted, a table of all bridges",
+        "name of the bridge to show; or add, followed by results files or folders of identify "
+        "--into or a worker; if omitted, a table of all bridges is shown",
         nargs="*",
         metavar="BRIDGE | add RESULTS …",
     )
     history: Path = history_option()
-    realm: str | None = opt("realm of the bridge, where it is in several (default: the only one)")
+    realm: str | None = opt("realm of the bridge, if it is in several (default: the only one)")
     period: "Unit" = opt(
         "period of fusion (default: month)", default="month", choices=("day", "week", "month")
     )

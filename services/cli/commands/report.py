@@ -25,7 +25,7 @@ class ReportOptions:
     """Options of `driveby report`: results, and the page."""
 
     results: tuple[Path, ...] = positional(
-        "results of identify or of a worker", Path, nargs="+", metavar="RESULTS.json"
+        "results files of identify or a worker", Path, nargs="+", metavar="RESULTS.json"
     )
     output: Path = output_option(
         "HTML file to write (default: report.html)",
