@@ -68,16 +68,6 @@ class FusedDraws(NamedTuple):
     tracks: tuple[SharedMismatch, ...]
 
 
-def fuse(parts: Sequence[FusionInput], priors: BridgePriors, count: int, seed: int) -> FusedDraws:
-    """Return draws of a bridge, `count` of each chain, from crossings in coordinates of `priors`.
-
-    The order of the parts does not matter. Raise ValueError without parts.
-    """
-    if not parts:
-        raise ValueError("no crossings to fuse")
-    return sample_joint(build_joint(parts, priors), priors, count, seed)
-
-
 def sample_joint(
     information: JointInformation,
     priors: BridgePriors,

@@ -13,7 +13,7 @@ from pre_core.crossing import mismatch as mm
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.posterior import layout, log_odds_of_absence
 from pre_core.fusion.information import BridgePriors
-from pre_core.fusion.joint import FusedDraws, fuse
+from pre_core.fusion.joint import FusedDraws, build_joint, sample_joint
 from pre_core.fusion.lateral_wander import (
     SharedFraction,
     align_runs_m,
@@ -54,6 +54,10 @@ from services.simulation.drawn import identify_simulated
 FloatArray = NDArray[np.float64]
 
 FRONT, REAR = TYPICAL_FOOTPRINTS
+
+
+def fuse(parts: list[FusionInput], priors: BridgePriors, count: int, seed: int) -> FusedDraws:
+    return sample_joint(build_joint(parts, priors), priors, count, seed)
 
 
 def whole() -> mm.Mismatch:
