@@ -63,7 +63,7 @@ class Slip(NamedTuple):
     units: tuple[tuple[str, float], ...]
 
 
-class Implied(NamedTuple):
+class ImpliedQuantity(NamedTuple):
     """A quantity that a site file implies, and its usual range."""
 
     name: str
@@ -95,7 +95,7 @@ class Implied(NamedTuple):
         return f"{usual}: {self.meant}" if self.meant else f"{usual}: check units and values"
 
 
-def implied_by(site: Site, vehicle: Vehicle) -> Iterator[Implied]:
+def implied_by(site: Site, vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     """Yield what a site file implies of a truck, its sensors and the bridges under it."""
     yield from of_truck(vehicle)
     yield from of_sensors(site.sensor, vehicle)
@@ -110,7 +110,7 @@ def warnings_of(site: Site, toml_text: str = "") -> list[str]:
     return list(dict.fromkeys(f"{one.text}: {one.advice}" for one in found if one.is_unusual))
 
 
-def of_truck(vehicle: Vehicle) -> Iterator[Implied]:
+def of_truck(vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     """Yield bounce, pitch and wheel hop of a truck, and the damping of its springs."""
     base = vehicle.wheelbase_m
     arms = (vehicle.front_axle_to_cg_m, vehicle.cg_to_rear_axle_m)
@@ -159,7 +159,7 @@ def of_truck(vehicle: Vehicle) -> Iterator[Implied]:
     yield from _odd(_tyres(vehicle))
 
 
-def of_frequencies(toml_text: str) -> Iterator[Implied]:
+def of_frequencies(toml_text: str) -> Iterator[ImpliedQuantity]:
     """Yield bridges of a site file whose EI contradicts the given first frequency.
 
     Raise InputError if the text is not TOML.
@@ -177,10 +177,12 @@ def of_frequencies(toml_text: str) -> Iterator[Implied]:
         )
         meant = f"flexural_rigidity_nm2 is {rigidity:g}: {rigidity * ratio:.3g} for {given_hz:g} Hz"
         low, high = _GIVEN_OVER_IMPLIED
-        yield Implied("given_frequency", text, ratio, low, high, "", meant, is_certain=False)
+        yield ImpliedQuantity(
+            "given_frequency", text, ratio, low, high, "", meant, is_certain=False
+        )
 
 
-def _loads(vehicle: Vehicle) -> Iterator[Implied]:
+def _loads(vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     """Yield loads that fit springs, tyres and axle masses only if front and rear are swapped."""
     pairs = (
         vehicle.suspension_stiffness_n_per_m,
@@ -201,10 +203,10 @@ def _loads(vehicle: Vehicle) -> Iterator[Implied]:
         f"front_axle_to_cg_m is {vehicle.front_axle_to_cg_m:g}: measured from the rear axle? then "
         f"it is {vehicle.cg_to_rear_axle_m:.4g}"
     )
-    yield Implied("loads_reversed", text, math.exp(apart), 1.0 / factor, factor, "", meant)
+    yield ImpliedQuantity("loads_reversed", text, math.exp(apart), 1.0 / factor, factor, "", meant)
 
 
-def _pairs(vehicle: Vehicle, loads: tuple[float, float]) -> Iterator[Implied]:
+def _pairs(vehicle: Vehicle, loads: tuple[float, float]) -> Iterator[ImpliedQuantity]:
     """Yield ratios of a truck's pairs, which show swapped values."""
     swapped = "[front, rear] swapped?"
     springs, tyres = vehicle.suspension_stiffness_n_per_m, vehicle.tyre_stiffness_n_per_m
@@ -212,19 +214,21 @@ def _pairs(vehicle: Vehicle, loads: tuple[float, float]) -> Iterator[Implied]:
         ratio = pair[0] / pair[1] * loads[1] / loads[0]
         text = f"{vehicle.id}: {key} over its load, front over rear, {ratio:.3g}"
         low, high = _FRONT_OVER_REAR
-        yield Implied(key, text, ratio, low, high, "", f"{key}_n_per_m: {swapped}")
+        yield ImpliedQuantity(key, text, ratio, low, high, "", f"{key}_n_per_m: {swapped}")
     ratio = vehicle.unsprung_mass_kg[0] / vehicle.unsprung_mass_kg[1]
     text = f"{vehicle.id}: front axle over rear axle, masses, {ratio:.3g}"
     low, high = _AXLE_OVER_REAR
-    yield Implied("axle_masses", text, ratio, low, high, "", f"unsprung_mass_kg: {swapped}")
+    yield ImpliedQuantity("axle_masses", text, ratio, low, high, "", f"unsprung_mass_kg: {swapped}")
     ratio = min(tyre / spring for tyre, spring in zip(tyres, springs, strict=True))
     text = f"{vehicle.id}: tyres over springs, stiffness, {ratio:.3g}"
     low, high = _TYRE_OVER_SPRING
     meant = "tyre_stiffness_n_per_m and suspension_stiffness_n_per_m swapped?"
-    yield Implied("tyres_over_springs", text, ratio, low, high, "", meant if ratio < low else "")
+    yield ImpliedQuantity(
+        "tyres_over_springs", text, ratio, low, high, "", meant if ratio < low else ""
+    )
 
 
-def _tyres(vehicle: Vehicle) -> Iterator[Implied]:
+def _tyres(vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     """Yield widths and distances of tyres and wheels."""
     for key, pair, (low, high) in (
         ("tyre_width_m", vehicle.tyre_width_m, _TYRE_WIDTH_M),
@@ -234,15 +238,15 @@ def _tyres(vehicle: Vehicle) -> Iterator[Implied]:
         for value in dict.fromkeys(pair or ()):
             if value > 0.0:
                 text = f"{vehicle.id}: {key} {value:g} m"
-                yield Implied(key, text, value, low, high, "m", "")
+                yield ImpliedQuantity(key, text, value, low, high, "m", "")
     apart = vehicle.twin_tyre_distance_m
     if apart is not None and apart[0] > 0.0 == apart[1]:
         text = f"{vehicle.id}: twin tyres in front, single ones behind"
         meant = "twin_tyre_distance_m: [front, rear] swapped?"
-        yield Implied("twin_tyres", text, 1.0, 0.0, 0.5, "", meant)
+        yield ImpliedQuantity("twin_tyres", text, 1.0, 0.0, 0.5, "", meant)
 
 
-def _odd(found: Iterator[Implied]) -> Iterator[Implied]:
+def _odd(found: Iterator[ImpliedQuantity]) -> Iterator[ImpliedQuantity]:
     """Yield what is unusual, never as certainly wrong: such trucks exist."""
     for one in found:
         if one.is_unusual:
@@ -254,7 +258,7 @@ def _as_ratio(damping: float, critical: float) -> tuple[tuple[str, float], ...]:
     return (("parts of critical damping", critical),) if 0.0 < damping <= 1.5 else ()
 
 
-def of_sensors(sensor: Sensor, vehicle: Vehicle) -> Iterator[Implied]:
+def of_sensors(sensor: Sensor, vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     """Yield the noise densities that are unusual; 0 is a simulation without noise."""
     declared = tuple(one.noise_density_ug_per_rthz for one in vehicle.sensors)
     for density in dict.fromkeys(declared or sensor.noise_density_ug_per_rthz):
@@ -266,7 +270,7 @@ def of_sensors(sensor: Sensor, vehicle: Vehicle) -> Iterator[Implied]:
             yield found
 
 
-def of_bridge(bridge: Bridge, vehicle: Vehicle) -> Iterator[Implied]:
+def of_bridge(bridge: Bridge, vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     """Yield first frequency and damping of a bridge, and what a truck does to it."""
     span, rigidity, mass = bridge.uniform()
     per_element = bridge.flexural_rigidity_per_element_nm2 is not None
@@ -309,7 +313,7 @@ def of_bridge(bridge: Bridge, vehicle: Vehicle) -> Iterator[Implied]:
     yield _implied("wheelbase_over_span", text, ratio, (0.0, 1.0), "", ())
 
 
-def _damping(bridge: Bridge, first_hz: float) -> Implied:
+def _damping(bridge: Bridge, first_hz: float) -> ImpliedQuantity:
     """Return the damping ratio of the first mode; no damping at all is a simulation's."""
     omega = 2.0 * math.pi * first_hz
     alpha, beta = bridge.rayleigh_alpha_per_s, bridge.rayleigh_beta_s
@@ -329,10 +333,12 @@ def _damping(bridge: Bridge, first_hz: float) -> Implied:
         larger = "rayleigh_beta_s" if beta * omega > alpha / omega else "rayleigh_alpha_per_s"
         meant = f"{larger} is too large"
     text = f"{bridge.id}: damping ratio {value:.3g} of the first mode"
-    return Implied("damping_ratio", text, value, low if value > 0.0 else 0.0, high, "", meant)
+    return ImpliedQuantity(
+        "damping_ratio", text, value, low if value > 0.0 else 0.0, high, "", meant
+    )
 
 
-def _idle_alpha(bridge: Bridge, first_hz: float) -> Iterator[Implied]:
+def _idle_alpha(bridge: Bridge, first_hz: float) -> Iterator[ImpliedQuantity]:
     """Yield an alpha that is a damping ratio by its size, and damps next to nothing."""
     omega = 2.0 * math.pi * first_hz
     alpha, beta = bridge.rayleigh_alpha_per_s, bridge.rayleigh_beta_s
@@ -343,10 +349,10 @@ def _idle_alpha(bridge: Bridge, first_hz: float) -> Iterator[Implied]:
     text = f"{bridge.id}: alpha over beta in the damping of the first mode {share:.2g}"
     probable = rayleigh_of(alpha, first_hz)[0]
     meant = f"rayleigh_alpha_per_s is {alpha:g}: a damping ratio? then it is {probable:.3g} 1/s"
-    yield Implied("idle_alpha", text, share, _IDLE, math.inf, "", meant)
+    yield ImpliedQuantity("idle_alpha", text, share, _IDLE, math.inf, "", meant)
 
 
-def _elements(bridge: Bridge) -> Iterator[Implied]:
+def _elements(bridge: Bridge) -> Iterator[ImpliedQuantity]:
     """Yield a bridge with one element for each span."""
     spans = len(bridge.lengths_of_spans_m)
     if bridge.elements > spans:
@@ -357,7 +363,7 @@ def _elements(bridge: Bridge) -> Iterator[Implied]:
         text = f"{bridge.id}: a single element: no weak place is located"
     meant = f"elements is {bridge.elements}: {probable} are typical here"
     value = float(bridge.elements)
-    yield Implied("elements", text, value, spans + 1.0, 3.0 * probable, "elements", meant)
+    yield ImpliedQuantity("elements", text, value, spans + 1.0, 3.0 * probable, "elements", meant)
 
 
 def _implied(
@@ -367,10 +373,10 @@ def _implied(
     limits: tuple[float, float],
     unit: str,
     slips: tuple[Slip, ...],
-) -> Implied:
+) -> ImpliedQuantity:
     low, high = limits
     meant = "" if low <= value <= high else _meant(value, limits, slips)
-    return Implied(name, text, value, low, high, unit, meant)
+    return ImpliedQuantity(name, text, value, low, high, unit, meant)
 
 
 def _meant(value: float, limits: tuple[float, float], slips: tuple[Slip, ...]) -> str:

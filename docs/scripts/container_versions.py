@@ -28,15 +28,15 @@ def problem(name: str, needed: tuple[int, int], command: tuple[str, ...]) -> str
         return f"{wanted}, but `{' '.join(command)}` does not answer"
     found = re.match(r"v?(\d+)\.(\d+)", done.stdout.strip())
     if done.returncode != 0 or found is None:
-        said = " ".join((done.stderr or done.stdout).split())[:200]
-        return f"{wanted}, but `{' '.join(command)}` says: {said or 'nothing'}"
+        answer = " ".join((done.stderr or done.stdout).split())[:200]
+        return f"{wanted}, but `{' '.join(command)}` says: {answer or 'nothing'}"
     if (int(found[1]), int(found[2])) < needed:
         return f"{wanted}, this is {done.stdout.strip()}"
     return None
 
 
 def main() -> int:
-    """Look at both and say the first problem."""
+    """Check both and print the first problem."""
     for name, (needed, command) in NEEDED.items():
         wrong = problem(name, needed, command)
         if wrong:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.kernels.lanes import kernel
-from pre_core.paper.integrate import Integrated
+from pre_core.paper.integrate import IntegratedMotion
 from pre_core.parameters import C_S1, K_S1, K_U1, M_U1
 
 FloatArray = NDArray[np.float64]
@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 def iep_signals(
     acceleration_m_per_s2: FloatArray,
     step_s: float,
-    integrate: Callable[[FloatArray, float], Integrated],
+    integrate: Callable[[FloatArray, float], IntegratedMotion],
 ) -> FloatArray:
     """Return the four signals of each wheel: (2, 4, n) z_u, z''_u, z'_u - z'_s, z_u - z_s.
 

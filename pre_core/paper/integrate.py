@@ -15,7 +15,7 @@ from pre_core.kernels.lanes import compiled
 FloatArray = NDArray[np.float64]
 
 
-class Integrated(NamedTuple):
+class IntegratedMotion(NamedTuple):
     """Velocity and displacement, both zero at the first sample; the shape of the input."""
 
     velocity: FloatArray
@@ -32,20 +32,20 @@ def _newmark(acceleration: FloatArray, step_s: float, v: FloatArray, u: FloatArr
             u[i, n] = u[i, n - 1] + step_s * v[i, n - 1] + 0.25 * step_s**2 * (a_before + a)
 
 
-def newmark_integrate(acceleration: FloatArray, step_s: float) -> Integrated:
+def newmark_integrate(acceleration: FloatArray, step_s: float) -> IntegratedMotion:
     """Integrate rows of evenly spaced samples (channels, n) twice by Newmark's scheme."""
     v = np.zeros_like(acceleration)
     u = np.zeros_like(acceleration)
     _newmark(acceleration, step_s, v, u)
-    return Integrated(v, u)
+    return IntegratedMotion(v, u)
 
 
-def spline_integrate(acceleration: FloatArray, step_s: float) -> Integrated:
+def spline_integrate(acceleration: FloatArray, step_s: float) -> IntegratedMotion:
     """Integrate rows of evenly spaced samples (channels, n) twice through a cubic spline."""
     from scipy.interpolate import CubicSpline  # slow to import, of the paper's method alone
 
     t = step_s * np.arange(acceleration.shape[1])
     spline = CubicSpline(t, acceleration, axis=1)
-    return Integrated(
+    return IntegratedMotion(
         np.asarray(spline.antiderivative(1)(t)), np.asarray(spline.antiderivative(2)(t))
     )

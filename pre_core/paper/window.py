@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.paper.iep import iep_signals
-from pre_core.paper.integrate import Integrated
+from pre_core.paper.integrate import IntegratedMotion
 from pre_core.physics.beam_basis import BeamBasis, beam_basis
 from pre_core.physics.bridge import locate_element
 from pre_core.physics.simulate import rear_position_m
@@ -36,7 +36,7 @@ class MeasuredCrossing(NamedTuple):
     element_lengths_m: FloatArray
     total_mass_kg: float
     wheelbase_m: float
-    integrate: Callable[[FloatArray, float], Integrated]
+    integrate: Callable[[FloatArray, float], IntegratedMotion]
     initial_state_known: bool
     """Whether the truck was at rest at the first sample, as in the paper.
 

@@ -39,7 +39,7 @@ from services.execution.offline import identify_drives, messages_of_trucks, site
 from services.finding.order import index_messages
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
 from services.history.validation_files import passed_validations
-from services.identification.bridge_state import Fusing
+from services.identification.bridge_state import FusionSettings
 from services.identification.comparison import baseline_cautions
 from services.identification.methods import lacks_noise
 from services.ledger.baselines import baselines_of
@@ -122,14 +122,14 @@ class _IdentifyRequest(NamedTuple):
     recordings: list[Path]
     site: Site
     settings: IdentificationSettings
-    fusing: Fusing
+    fusing: FusionSettings
     certificates: Mapping[VehicleBridgePair, str]
 
 
 def _request(asked: IdentifyOptions, files: list[Path]) -> _IdentifyRequest:
     site = site_of(files, asked.site)
     beside = None if asked.site is None else asked.site.parent
-    fusing = Fusing(baselines_of(site, beside, asked.baseline), asked.fuse_suspect)
+    fusing = FusionSettings(baselines_of(site, beside, asked.baseline), asked.fuse_suspect)
     method, seed = asked.search_method, asked.seed
     settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
     warn_of_no_noise(site, method)

@@ -27,7 +27,7 @@ from services.execution.dispatch import CrossingExecutor
 from services.execution.inline import InlineExecutor
 from services.execution.result_store import BRIDGES, ResultStore
 from services.history.validation_files import passed_validations
-from services.identification.bridge_state import Fusing, with_common_shares
+from services.identification.bridge_state import FusionSettings, with_common_shares
 from services.ledger.baselines import baselines_of
 from services.recordings.remote import (
     Recording,
@@ -79,7 +79,7 @@ def archive_command(
         tuple(recordings),
         known,
         settings,
-        Fusing(
+        FusionSettings(
             baselines_of(known, None if site is None else site.parent, options.baseline),
             options.fuse_suspect,
         ),

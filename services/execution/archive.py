@@ -37,7 +37,7 @@ from services.finding.finder import Finder, Found
 from services.finding.order import STREAMS, cached_reader, in_measurement_order, index_messages
 from services.finding.stays import LONGEST_STAY_S
 from services.identification.bridge_state import (
-    Fusing,
+    FusionSettings,
     RecentCrossings,
     add_crossings,
     against,
@@ -65,7 +65,7 @@ class ArchiveJob(NamedTuple):
     recordings: tuple[Recording, ...]
     site: Site
     settings: IdentificationSettings
-    fusing: Fusing
+    fusing: FusionSettings
     certificates: Mapping[VehicleBridgePair, str]
 
     @property
@@ -388,7 +388,9 @@ class _UnsavedResults:
 
 
 def _fused(
-    counted: Mapping[tuple[str, str], RecentCrossings], fusing: Fusing, execution: CrossingExecutor
+    counted: Mapping[tuple[str, str], RecentCrossings],
+    fusing: FusionSettings,
+    execution: CrossingExecutor,
 ) -> dict[str, BridgeResult]:
     """Return the states of all bridges; of a bridge in several realms the last one."""
     states: dict[str, BridgeResult] = {}

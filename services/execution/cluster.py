@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 from schemas.results import CrossingResult
 from services.common.errors import FailureError
 from services.common.extras import check_installed
-from services.execution.cluster_worker import BatchFailed, BatchRefused, packed, unpacked
+from services.execution.cluster_worker import BatchFailure, BatchRefusal, packed, unpacked
 from services.execution.dispatch import FusionResult, RunningCrossing, TaskResult, failed_result
 from services.execution.inline import InlineExecutor
 from services.execution.program import program
@@ -243,11 +243,11 @@ class DaskExecutor:
                 self._failed(sent.batch, f"{type(error).__name__}: {error}")
             return is_error
         self._forget(sent)
-        if isinstance(answer, BatchRefused):
+        if isinstance(answer, BatchRefusal):
             _log.warning("worker %s: %s; retiring it", answer.worker, answer.why)
             self._scheduler.retire_worker(answer.worker)
             self._to_send.append(sent.batch._replace(tries=sent.batch.tries + 1))
-        elif isinstance(answer, BatchFailed):
+        elif isinstance(answer, BatchFailure):
             self._failed(sent.batch, f"worker {answer.worker}: {answer.why}")
         else:
             results: tuple[CrossingResult, ...] = unpacked(answer)

@@ -32,14 +32,14 @@ class WorkerInfo(NamedTuple):
     """Reason why it can identify nothing; empty if it can."""
 
 
-class BatchRefused(NamedTuple):
+class BatchRefusal(NamedTuple):
     """A worker's refusal to run a batch, which is meant for another program."""
 
     worker: str
     why: str
 
 
-class BatchFailed(NamedTuple):
+class BatchFailure(NamedTuple):
     """Failure of a batch as a whole; returned, because not every exception can be transmitted."""
 
     worker: str
@@ -56,7 +56,7 @@ def worker_info() -> WorkerInfo:
     return WorkerInfo(program(), processor(), cannot if daemon else "")
 
 
-def identify_batch(batch: bytes, meant_for: dict[str, str]) -> bytes | BatchRefused | BatchFailed:
+def identify_batch(batch: bytes, meant_for: dict[str, str]) -> bytes | BatchRefusal | BatchFailure:
     """Identify packed crossings; return their packed results in order. To be called on a worker."""
     from distributed import get_worker
 
@@ -64,11 +64,11 @@ def identify_batch(batch: bytes, meant_for: dict[str, str]) -> bytes | BatchRefu
     worker = str(get_worker().address)
     why = version_difference(here.program, meant_for) or here.cannot
     if why:
-        return BatchRefused(worker, why)
+        return BatchRefusal(worker, why)
     try:
         return packed(_results(unpacked(batch)))
     except Exception as error:  # whatever it is, the client must receive it
-        return BatchFailed(worker, f"{type(error).__name__}: {error}")
+        return BatchFailure(worker, f"{type(error).__name__}: {error}")
 
 
 def packed(content: Iterable[Any]) -> bytes:

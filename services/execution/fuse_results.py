@@ -10,7 +10,7 @@ from schemas.settings import IdentificationSettings
 from services.common.errors import InputError
 from services.common.progress import Parts, no_part_progress
 from services.identification.bridge_state import (
-    Fusing,
+    FusionSettings,
     RecentCrossings,
     add_crossings,
     state_of,
@@ -89,7 +89,7 @@ def fuse_crossings(
     crossing can be fused; `name` is the place that such an error begins with.
     """
     baselines = {} if stored is None else stored[1].bridges
-    fusing = Fusing(baselines, fuse_suspect, IdentificationSettings().threads)
+    fusing = FusionSettings(baselines, fuse_suspect, IdentificationSettings().threads)
     elements_of = {bridge: _elements(bridge, of) for bridge, of in found.by_bridge.items()}
     for bridge, elements in elements_of.items():
         if stored is not None and elements is not None and bridge in baselines:
@@ -113,12 +113,12 @@ def fuse_crossings(
 
 def fuse_bridge(name: str, crossings: Sequence[CrossingResult]) -> BridgeResult | None:
     """Return the state of one bridge from all its crossings; None if none can be fused."""
-    fusing = Fusing(threads=IdentificationSettings().threads)
+    fusing = FusionSettings(threads=IdentificationSettings().threads)
     return _state(name, list(crossings), fusing, no_part_progress)
 
 
 def _state(
-    name: str, crossings: list[CrossingResult], fusing: Fusing, report: Parts
+    name: str, crossings: list[CrossingResult], fusing: FusionSettings, report: Parts
 ) -> BridgeResult | None:
     counts = [one for one in map(usable, crossings) if one is not None]
     state = state_of(add_crossings(RecentCrossings(), counts), name, fusing, partial(report, name))

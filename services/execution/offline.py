@@ -25,7 +25,7 @@ from services.finding.order import (
     in_measurement_order,
     malformed,
 )
-from services.identification.bridge_state import NOTHING_STORED, Fusing, with_common_shares
+from services.identification.bridge_state import NOTHING_STORED, FusionSettings, with_common_shares
 from services.identification.engine import Engine
 from services.identification.outputs import EngineOutput
 from services.identification.waiting import Validations
@@ -76,7 +76,7 @@ def identify_drives(
     settings: IdentificationSettings,
     execution: CrossingExecutor,
     report: Report,
-    fusing: Fusing = NOTHING_STORED,
+    fusing: FusionSettings = NOTHING_STORED,
     certificates: Mapping[VehicleBridgePair, str] | None = None,
 ) -> Results:
     """Identify all crossings in the drives, which are read again, message by message.

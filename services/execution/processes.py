@@ -35,7 +35,7 @@ from services.execution.dispatch import FusionResult, RunningCrossing, TaskResul
 from services.execution.hang_watchdog import HangWatchdog, TaskLimits
 from services.execution.inline import InlineExecutor, Report
 from services.execution.warm_up import warm_up
-from services.identification.bridge_state import Fusing, RecentCrossings, state_of
+from services.identification.bridge_state import FusionSettings, RecentCrossings, state_of
 from services.identification.identify import Identify, identify
 from services.identification.outputs import FusionTask, IdentificationTask
 
@@ -68,7 +68,7 @@ class BackgroundResult(NamedTuple):
     outcome: object | None
 
 
-StateOf = Callable[[RecentCrossings, str, Fusing], BridgeResult | None]
+StateOf = Callable[[RecentCrossings, str, FusionSettings], BridgeResult | None]
 """Type of `estimate_bridge_state`."""
 _Task = IdentificationTask | FusionTask | BackgroundTask
 _BridgeName = tuple[str, str]

@@ -109,7 +109,7 @@ def _fused(
         pass  # not fused yet, or the file was truncated
     # Kernels are slow to import, and usually there is nothing to fuse.
     from services.identification.bridge_state import (
-        Fusing,
+        FusionSettings,
         RecentCrossings,
         add_crossings,
         state_of,
@@ -122,7 +122,7 @@ def _fused(
         except ValueError as error:
             warn(f"{one.crossing_id}: left out: {' '.join(str(error).split())[:120]}")
     counted = add_crossings(RecentCrossings(), [one for one in some if one is not None])
-    state = state_of(counted, bridge, Fusing(threads=IdentificationSettings().threads))
+    state = state_of(counted, bridge, FusionSettings(threads=IdentificationSettings().threads))
     if state is not None:
         try:
             make_folder(cache)

@@ -40,7 +40,7 @@ from services.identification.usable import usable as usable
 _MANY = 1.0 / 3.0
 
 
-class Fusing(NamedTuple):
+class FusionSettings(NamedTuple):
     """Settings of fusion and comparison."""
 
     baselines: Mapping[str, BridgeResult] = {}
@@ -51,7 +51,7 @@ class Fusing(NamedTuple):
     """Number of threads, on which the state does not depend."""
 
 
-NOTHING_STORED = Fusing()
+NOTHING_STORED = FusionSettings()
 _SOUND = 0.9
 """Share of the baseline; see `Derived.probability_below_90_percent_of_baseline`."""
 
@@ -82,7 +82,7 @@ def _probability_below(share: float, now: Parameter, before: ElementState) -> fl
 def state_of(
     counted: RecentCrossings,
     bridge: str,
-    fusing: Fusing = NOTHING_STORED,
+    fusing: FusionSettings = NOTHING_STORED,
     report: Report = lambda stage, fraction: None,
 ) -> BridgeResult | None:
     """Return the state of a bridge from all its good crossings; None without an estimate.
@@ -163,7 +163,7 @@ def _thirds(found: FusedBridge) -> ThirdsState:
 class States:
     """States of bridges, recomputed only after new crossings: one takes up to a second."""
 
-    def __init__(self, fusing: Fusing) -> None:
+    def __init__(self, fusing: FusionSettings) -> None:
         self.fusing = fusing
         self._made: dict[Hashable, tuple[RecentCrossings, BridgeResult | None]] = {}
 

@@ -10,7 +10,7 @@ from schemas.results_on_the_wire import crossing_to_protobuf
 from schemas.topics import Key
 from services.identification.bridge_state import (
     LISTED_AT_MOST,
-    Fusing,
+    FusionSettings,
     RecentCrossings,
     add_crossings,
     against,
@@ -18,7 +18,7 @@ from services.identification.bridge_state import (
 )
 from services.identification.known import CrossingRecord
 from services.identification.outputs import FusionTask, IdentificationTask, Output, state_output
-from services.identification.waiting import Pending
+from services.identification.waiting import PendingCrossing
 
 _log = logging.getLogger(__name__)
 Name = tuple[str, str]
@@ -30,7 +30,7 @@ class _OfBridge:
     """Crossings and state of one bridge in one realm."""
 
     counted: RecentCrossings = field(default_factory=RecentCrossings)
-    running: deque[Pending] = field(default_factory=deque)
+    running: deque[PendingCrossing] = field(default_factory=deque)
     """Running crossings in the order of detection, in which their results are published."""
     state: BridgeResult | None = None
     """Latest state of the counted crossings."""
@@ -51,13 +51,15 @@ class BridgeStates:
         Whether a state is computed after each result; otherwise at the end (`fuse_all`).
     """
 
-    def __init__(self, header: ResultHeader, fusing: Fusing, *, are_published: bool = True) -> None:
+    def __init__(
+        self, header: ResultHeader, fusing: FusionSettings, *, are_published: bool = True
+    ) -> None:
         self._header = header
         self._fusing = fusing
         self._are_published = are_published
         self._of_bridge: dict[Name, _OfBridge] = {}
 
-    def retarget(self, header: ResultHeader, fusing: Fusing) -> None:
+    def retarget(self, header: ResultHeader, fusing: FusionSettings) -> None:
         """Continue with another site file: the states of bridges start again."""
         self._header, self._fusing = header, fusing
         self._of_bridge.clear()
@@ -86,7 +88,7 @@ class BridgeStates:
         for name, exit_time in owed.items():
             yield self._fuse(name, exit_time)
 
-    def begin(self, pending: Pending) -> None:
+    def begin(self, pending: PendingCrossing) -> None:
         """Record that a crossing is being identified."""
         data = pending.work.data
         self._at(data.realm, data.bridge.id).running.append(pending)
@@ -113,7 +115,7 @@ class BridgeStates:
             yield from self._published(bridge, first, bridge.results.pop(first.work.number))
 
     def _published(
-        self, bridge: _OfBridge, found: Pending, result: CrossingResult
+        self, bridge: _OfBridge, found: PendingCrossing, result: CrossingResult
     ) -> Iterator[Output | FusionTask]:
         realm, name = found.work.data.realm, found.work.data.bridge.id
         result = against(result, self._fusing.baselines.get(name))

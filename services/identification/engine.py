@@ -17,7 +17,7 @@ from schemas.topics import Key
 from schemas.validation_records import ValidationHashes, VehicleBridgePair
 from services.finding.crossing_data import Complete
 from services.finding.finder import Finder, Found
-from services.identification.bridge_state import NOTHING_STORED, Fusing
+from services.identification.bridge_state import NOTHING_STORED, FusionSettings
 from services.identification.bridge_states import BridgeStates
 from services.identification.known import CrossingRecord
 from services.identification.methods import window_of
@@ -32,10 +32,10 @@ from services.identification.outputs import (
 )
 from services.identification.waiting import (
     NO_VALIDATIONS,
-    FromRecording,
-    Pending,
+    CrossingFromRecording,
+    PendingCrossing,
     Validations,
-    Waiting,
+    WaitingCrossings,
     pending_of,
 )
 
@@ -64,7 +64,7 @@ class Engine:
         site: Site,
         settings: IdentificationSettings,
         header: ResultHeader,
-        fusing: Fusing = NOTHING_STORED,
+        fusing: FusionSettings = NOTHING_STORED,
         *,
         validations: Validations = NO_VALIDATIONS,
         publishes_states: bool = True,
@@ -73,7 +73,7 @@ class Engine:
         self._settings = settings
         self._names = Names()
         self._finder = Finder(site, window_of(settings.method), self._names.recognise)
-        self._waiting = Waiting(validations, has_room=has_room)
+        self._waiting = WaitingCrossings(validations, has_room=has_room)
         self._states = BridgeStates(header, fusing, are_published=publishes_states)
         self._works = 0
         """Number of tasks up to now."""
@@ -104,7 +104,11 @@ class Engine:
             known.last = known.usable = None  # they are not needed again, and they are large
 
     def retarget(
-        self, site: Site, header: ResultHeader, fusing: Fusing, certificates: ValidationHashes
+        self,
+        site: Site,
+        header: ResultHeader,
+        fusing: FusionSettings,
+        certificates: ValidationHashes,
     ) -> Iterator[ValidationRequest]:
         """Continue with another site file, when no task is running; yield validation requests.
 
@@ -183,14 +187,16 @@ class Engine:
         self._works += 1
         return IdentificationTask(self._works, one.data, self._settings)
 
-    def _begun(self, pending: Pending) -> Iterator[EngineOutput]:
+    def _begun(self, pending: PendingCrossing) -> Iterator[EngineOutput]:
         if pending.identifying is not None:
             yield pending.identifying
         pending = pending._replace(work=self._waiting.certified(pending.work))
         self._states.begin(pending)
         yield pending.work
 
-    def take(self, found: FromRecording, others: Iterable[str] = ()) -> Iterator[EngineOutput]:
+    def take(
+        self, found: CrossingFromRecording, others: Iterable[str] = ()
+    ) -> Iterator[EngineOutput]:
         """Accept a crossing from a recording; `others` were on the bridge, too.
 
         Messages of the trucks themselves give no second crossing from now on.
@@ -227,7 +233,7 @@ class Engine:
         return self._waiting.by_pair()
 
     def waiting_pairs(self) -> list[VehicleBridgePair]:
-        """Return the pairs with waiting crossings: with most first (`Waiting.pairs`)."""
+        """Return the pairs with waiting crossings: with most first (`WaitingCrossings.pairs`)."""
         return self._waiting.pairs()
 
     def certify(self, pair: VehicleBridgePair, certificate: str) -> None:

@@ -10,7 +10,7 @@ from schemas.topics import Key
 from schemas.validation_records import VehicleBridgePair
 from services.finding.crossing_data import CrossingData, Detection
 from services.finding.stays import Passage
-from services.identification.bridge_state import Fusing, RecentCrossings
+from services.identification.bridge_state import FusionSettings, RecentCrossings
 
 
 class Output(NamedTuple):
@@ -46,7 +46,7 @@ class FusionTask(NamedTuple):
     realm: str
     bridge: str
     counted: RecentCrossings
-    fusing: Fusing
+    fusing: FusionSettings
     exit_time: float
     """Exit of the crossing after which the state is published (s since 1970 UTC)."""
 

@@ -33,7 +33,7 @@ class Validations(NamedTuple):
 NO_VALIDATIONS = Validations()
 
 
-class Pending(NamedTuple):
+class PendingCrossing(NamedTuple):
     """A complete crossing, with the messages about its identification."""
 
     work: IdentificationTask
@@ -50,7 +50,7 @@ class Pending(NamedTuple):
 
 def pending_of(
     one: Complete, work: IdentificationTask, reported: Collection[pb.CrossingState]
-) -> Pending:
+) -> PendingCrossing:
     """Return a crossing with its messages, less those that have been `reported`."""
     found = one.detection
 
@@ -58,21 +58,21 @@ def pending_of(
         return crossing_output(found, state, found.exit_ns)
 
     identifying = None if pb.IDENTIFYING in reported else output(pb.IDENTIFYING)
-    return Pending(work, identifying, output(pb.DONE))
+    return PendingCrossing(work, identifying, output(pb.DONE))
 
 
-class FromRecording(NamedTuple):
+class CrossingFromRecording(NamedTuple):
     """A complete crossing from a recording."""
 
     messages: tuple[Output, ...]
     """Messages of its detection and completion that earlier runs have not published."""
-    pending: Pending
+    pending: PendingCrossing
     entry_ns: int
     """Entry in ns since 1970 UTC."""
     exit_ns: int
 
 
-class Waiting:
+class WaitingCrossings:
     """Crossings that wait, in the order of detection; at most `MAX_WAITING_CROSSINGS`.
 
     Parameters
@@ -90,7 +90,7 @@ class Waiting:
         self._has_room = has_room
         self._recorded: frozenset[str] = frozenset()
         self._wanted: set[VehicleBridgePair] = set()
-        self._pending: deque[Pending] = deque()
+        self._pending: deque[PendingCrossing] = deque()
 
     def retarget(
         self,
@@ -132,7 +132,7 @@ class Waiting:
         for_room = pair.vehicle in self._recorded and not self._has_room()
         return not self.is_certified(pair) or for_room or pair in self.by_pair()
 
-    def keep(self, pending: Pending) -> Iterator[ValidationRequest]:
+    def keep(self, pending: PendingCrossing) -> Iterator[ValidationRequest]:
         """Add a crossing; yield the validation request for its pair, once for a pair."""
         self._pending.append(pending)
         if len(self._pending) > MAX_WAITING_CROSSINGS:
@@ -166,7 +166,7 @@ class Waiting:
         """Whether a crossing may continue."""
         return any(self.is_certified(one.pair) for one in self._pending)
 
-    def release(self) -> Pending | None:
+    def release(self) -> PendingCrossing | None:
         """Return and remove the first crossing that may continue, if there is one."""
         for place, one in enumerate(self._pending):
             if self.is_certified(one.pair):

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from schemas.site import Bridge, Site, Vehicle
-from schemas.site_usual import Implied, implied_by
+from schemas.site_usual import ImpliedQuantity, implied_by
 from schemas.site_vehicle import axle_loads_kg
 from services.finding.placed import densities_ug_per_rthz, rates_hz, sensors_in_words
 from services.identification.checks import ALIKE_LOADS
@@ -36,7 +36,7 @@ def findings_of_implied(site: Site, vehicle: Vehicle) -> Iterator[CheckFinding]:
     yield from map(finding_of_implied, implied_by(site, vehicle))
 
 
-def finding_of_implied(one: Implied) -> CheckFinding:
+def finding_of_implied(one: ImpliedQuantity) -> CheckFinding:
     """Return the finding on one quantity: open where it is unusual, wrong where far from that."""
     state = (
         CheckStatus.WRONG if one.is_far else CheckStatus.OPEN if one.is_unusual else CheckStatus.OK

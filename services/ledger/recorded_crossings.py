@@ -31,7 +31,7 @@ from services.identification.known import CrossingRecord
 from services.identification.methods import window_of
 from services.identification.names import Names
 from services.identification.outputs import IdentificationTask, Output, crossing_output
-from services.identification.waiting import FromRecording, pending_of
+from services.identification.waiting import CrossingFromRecording, pending_of
 from services.recordings.recording import is_being_written, read_messages
 
 Ints = NDArray[np.int64]
@@ -67,7 +67,7 @@ class StayScan(NamedTuple):
 class FetchResult(NamedTuple):
     """Data of requested stays, as far as the recordings hold them."""
 
-    found: tuple[tuple[RecordedStay, FromRecording], ...]
+    found: tuple[tuple[RecordedStay, CrossingFromRecording], ...]
     missing: tuple[RecordedStay, ...]
     """Stays whose data may still arrive."""
 
@@ -175,7 +175,7 @@ def fetch_crossings(
         for message in _messages(path, realm, vehicle, []):
             if message.boot_id == boot_id and _is_wanted(message, wanted):
                 messages.setdefault((message.key.stream, message.sequence), message)
-    found: list[tuple[RecordedStay, FromRecording]] = []
+    found: list[tuple[RecordedStay, CrossingFromRecording]] = []
     missing: list[RecordedStay] = []
     for stay in wanted:
         near = [m for m in messages.values() if _is_wanted(m, [stay])]
@@ -218,7 +218,7 @@ def _decided(
     known: Sequence[CrossingRecord],
     site: Site,
     settings: IdentificationSettings,
-) -> FromRecording | None:
+) -> CrossingFromRecording | None:
     """Return the result of a finder for one stay, from the messages around it."""
     names = Names(known)
     finder = Finder(site, window_of(settings.method), names.recognise)
@@ -228,7 +228,7 @@ def _decided(
         if at.bridge == wanted.bridge and are_one(*times, wanted.entry_ns, wanted.exit_ns):
             reported = names.reported(at)
             pending = pending_of(one, IdentificationTask(0, one.data, settings), reported)
-            return FromRecording(tuple(_begun(one, reported)), pending, *times)
+            return CrossingFromRecording(tuple(_begun(one, reported)), pending, *times)
     return None
 
 

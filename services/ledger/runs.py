@@ -23,7 +23,7 @@ from services.common.errors import FailureError
 from services.common.files import replaced_atomically
 from services.identification.bridge_state import (
     NOTHING_STORED,
-    Fusing,
+    FusionSettings,
     RecentCrossings,
     States,
     add_crossings,
@@ -197,7 +197,7 @@ class _Run(NamedTuple):
 class _EarlierReader:
     """Collected content of the files; of the messages only those needed later."""
 
-    def __init__(self, search: str, fusing: Fusing) -> None:
+    def __init__(self, search: str, fusing: FusionSettings) -> None:
         self._states = States(fusing)
         self.log = CrossingLog(search)
         self.published: dict[MessageName, None] = {}
@@ -235,7 +235,7 @@ def read_earlier(
     realm: str,
     now_s: float,
     search: str,
-    fusing: Fusing = NOTHING_STORED,
+    fusing: FusionSettings = NOTHING_STORED,
     age_s: float = KNOWN_AGE_S,
 ) -> EarlierRuns:
     """Read the files of earlier runs of a realm in a folder, no older than `age_s`.

@@ -14,8 +14,8 @@ from services.recordings.writer import Misplaced, RecordingWriter
 _log = logging.getLogger(__name__)
 
 
-class WriteFailed(Exception):  # noqa: N818  # states what happened, as OSError does not
-    """Writing failed, with the file at fault; without a name it was the disk."""
+class WriteError(Exception):
+    """Failure to write a file; without a name the disk is at fault."""
 
     def __init__(self, name: FileName | None, reason: str, kind: EventKind) -> None:
         super().__init__(reason)
@@ -33,10 +33,10 @@ def failing(name: FileName) -> Iterator[None]:
         raise failure_of(name, error) from error
 
 
-def failure_of(name: FileName, error: OSError | InputError) -> WriteFailed:
+def failure_of(name: FileName, error: OSError | InputError) -> WriteError:
     """Return an error with the name of the file."""
     reason = getattr(error, "strerror", None) or str(error)
-    return WriteFailed(name, reason, EventKind.WRITE_ERROR)
+    return WriteError(name, reason, EventKind.WRITE_ERROR)
 
 
 @dataclass

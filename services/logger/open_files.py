@@ -57,7 +57,7 @@ class RotationLimits(NamedTuple):
 
 
 class OpenFiles:
-    """The open recordings of all trucks, for one thread; every method may raise `WriteFailed`.
+    """The open recordings of all trucks, for one thread; every method may raise `WriteError`.
 
     Other threads may read figures, empty the deques, and use `drops` and `durable`, which lock.
     """

@@ -18,7 +18,7 @@ from services.logger.backlog import Backlog
 from services.logger.disk_room import DiskRoom, NoRoomError
 from services.logger.drops import FAILED, QUEUE_IS_FULL, Drop
 from services.logger.file_layout import FileName, RecordingTarget
-from services.logger.open_file import WriteFailed
+from services.logger.open_file import WriteError
 from services.logger.open_files import OpenFiles, RotationLimits
 from services.logger.own_events import OwnEvents
 
@@ -138,7 +138,7 @@ class FileWriter:
             self._write_all()
             reason, counts = self._end
             self._files.finish(reason, counts)
-        except WriteFailed as failed:
+        except WriteError as failed:
             self._stop(failed.name, f"recording stopped: {failed.reason}", failed.kind)
         except Exception as error:  # any error must be reported, and no thread left waiting
             _log.exception("writing failed; recording stops")
@@ -172,7 +172,7 @@ class FileWriter:
         try:
             left = self.room.check()
         except NoRoomError as error:
-            raise WriteFailed(None, str(error), EventKind.DISK_LOW) from None
+            raise WriteError(None, str(error), EventKind.DISK_LOW) from None
         if left is not None:
             self._files.write_event(Event(EventKind.DISK_LOW, time.time_ns(), left))
 

@@ -101,7 +101,7 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-class Indexed(NamedTuple):
+class ChannelCount(NamedTuple):
     """Number of messages of a channel in the previous chunk, according to its index."""
 
     channel_id: int
@@ -120,7 +120,9 @@ class Damage(NamedTuple):
     """Whether the file ends here."""
 
 
-Item = Schema | Channel | RawMessage | Indexed | Attachment | Metadata | DataEnd | Footer | Damage
+Item = (
+    Schema | Channel | RawMessage | ChannelCount | Attachment | Metadata | DataEnd | Footer | Damage
+)
 
 
 def scan(file: BinaryIO, start: int = 0) -> Iterator[Item]:
@@ -266,7 +268,7 @@ def _plain_record_at(file: BinaryIO, at: int, opcode: int, length: int) -> _Mcap
         entries, rest = divmod(array_bytes, _INDEX_ENTRY_BYTES)
         if rest or array_bytes != length - _INDEX.size:
             return None
-        return _found(end, Indexed(channel_id, entries))
+        return _found(end, ChannelCount(channel_id, entries))
     kind = _READABLE.get(opcode)
     if kind is None:
         return None

@@ -23,7 +23,7 @@ from services.common.interrupts import interrupts_held
 from services.common.intervals import Intervals
 from services.common.progress import Offset, no_progress
 from services.recordings.mcap_file import McapWriter
-from services.recordings.mcap_scan import Damage, Indexed, RawMessage, scan
+from services.recordings.mcap_scan import ChannelCount, Damage, RawMessage, scan
 from services.recordings.recording import (
     ABOUT,
     END,
@@ -191,7 +191,7 @@ class _Copier:
             case RawMessage():
                 self._is_after_damage = False
                 self._copy(item)
-            case Indexed():
+            case ChannelCount():
                 # The index of a damaged chunk may be intact.
                 self._lost_by_index += item.messages if self._is_after_damage else 0
             case Schema():

@@ -17,7 +17,7 @@ from services.common.language import ENGLISH, Language
 from services.execution.blas import one_blas_thread
 from services.history.bridge_history import BridgeHistory
 from services.identification.comparison import Comparison, Estimate, compare, per_cent_up
-from services.report.cautions import Measured, cautions
+from services.report.cautions import CautionBasis, cautions
 from services.report.earlier import Before, SurveyFile, before_of, combined_surveys
 from services.viewer.bridge_view import BridgeView, describe_bridge, view_of_bridge
 
@@ -143,7 +143,7 @@ def _report(
         before,
         _finding(view, crossings, stored, language),
         _quality(view, crossings, language),
-        tuple(cautions(Measured(bridge, view, used, before, combined), language)),
+        tuple(cautions(CautionBasis(bridge, view, used, before, combined), language)),
     )
 
 

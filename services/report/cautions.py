@@ -19,7 +19,7 @@ from services.identification.comparison import (
     compare,
     shared_crossings,
 )
-from services.report.earlier import Before, Combined, days_between, season_of
+from services.report.earlier import Before, CombinedSurveys, days_between, season_of
 from services.report.place import ends_of
 from services.viewer.bridge_view import BridgeView
 
@@ -33,7 +33,7 @@ _WARMER_K = 20.0
 """Difference of temperature in K by which the effect of a season is illustrated."""
 
 
-class Measured(NamedTuple):
+class CautionBasis(NamedTuple):
     """The measurement that cautions are about."""
 
     bridge: Bridge
@@ -41,10 +41,10 @@ class Measured(NamedTuple):
     crossings: tuple[CrossingResult, ...]
     """Crossings behind the numbers, in order of time."""
     before: Before | None
-    combined: Combined | None
+    combined: CombinedSurveys | None
 
 
-def cautions(measured: Measured, language: Language) -> Iterator[str]:
+def cautions(measured: CautionBasis, language: Language) -> Iterator[str]:
     """Yield the cautions on a finding, the most important one first."""
     if measured.view.estimate is None:
         return
@@ -88,7 +88,7 @@ def named_elements(numbers: Sequence[int], language: Language) -> str:
     return language.text(which, elements=language.listed([str(number) for number in numbers]))
 
 
-def _same_crossings(measured: Measured, language: Language) -> Iterator[str]:
+def _same_crossings(measured: CautionBasis, language: Language) -> Iterator[str]:
     """Yield how many crossings the baseline shares with the measurement compared with it."""
     if measured.before is None:
         return
@@ -111,7 +111,7 @@ def _implausible(comparison: Comparison, language: Language) -> Iterator[str]:
     )
 
 
-def _implausible_before(measured: Measured, language: Language) -> Iterator[str]:
+def _implausible_before(measured: CautionBasis, language: Language) -> Iterator[str]:
     """Yield that changes are not certain where the baseline itself is implausible."""
     found = _alone(measured.view, measured.before)
     numbers = [] if found is None else [element.number for element in found.implausible]
@@ -142,7 +142,7 @@ def _lower(view: BridgeView, comparison: Comparison, language: Language) -> Iter
         )
 
 
-def _earlier(measured: Measured, language: Language) -> Iterator[str]:
+def _earlier(measured: CautionBasis, language: Language) -> Iterator[str]:
     weak = weak_before(measured.view, measured.before)
     if weak:
         listed = [
@@ -158,7 +158,7 @@ def _earlier(measured: Measured, language: Language) -> Iterator[str]:
         yield language.choice("caution.earlier", len(weak), elements=language.listed(listed))
 
 
-def _seasons(measured: Measured, language: Language) -> Iterator[str]:
+def _seasons(measured: CautionBasis, language: Language) -> Iterator[str]:
     """Yield how far two compared surveys are apart, and what the temperature does."""
     before = measured.before
     if before is None or not before.crossings or not measured.crossings:
@@ -180,7 +180,7 @@ def _seasons(measured: Measured, language: Language) -> Iterator[str]:
     )
 
 
-def _combined(combined: Combined | None, language: Language) -> Iterator[str]:
+def _combined(combined: CombinedSurveys | None, language: Language) -> Iterator[str]:
     if combined is None:
         return
     how = language.text("caution.no_command")
@@ -195,7 +195,7 @@ def _combined(combined: Combined | None, language: Language) -> Iterator[str]:
     )
 
 
-def _ends(measured: Measured, language: Language) -> Iterator[str]:
+def _ends(measured: CautionBasis, language: Language) -> Iterator[str]:
     """Yield which ends are likely to be restrained or to yield, unless that is declared."""
     known = [crossing.derived for crossing in measured.crossings if crossing.derived is not None]
     is_declared = [bearing == "sprung" for bearing in measured.bridge.bearings]

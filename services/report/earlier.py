@@ -41,7 +41,7 @@ class SurveyFile(NamedTuple):
     last_s: float
 
 
-class Combined(NamedTuple):
+class CombinedSurveys(NamedTuple):
     """Two surveys that one state combines; the pause between them in s since 1970."""
 
     earlier_s: float
@@ -71,7 +71,7 @@ def before_of(
 
 def combined_surveys(
     files: Sequence[SurveyFile], crossings: Sequence[CrossingResult]
-) -> Combined | None:
+) -> CombinedSurveys | None:
     """Return the last pause between surveys among the crossings of a state; None without one."""
     times = sorted(crossing.entry_time for crossing in crossings)
     pauses = [one for one in pairwise(times) if one[1] - one[0] >= PAUSE_DAYS * DAY_S]
@@ -85,7 +85,7 @@ def combined_surveys(
         baseline = max(earlier, key=lambda file: file.last_s)
         names = [file.name for file in sorted(later, key=lambda file: file.first_s)]
         command = shlex.join(["driveby", "report", *names, "--baseline", baseline.name])
-    return Combined(earlier_s, later_s, command)
+    return CombinedSurveys(earlier_s, later_s, command)
 
 
 def days_between(earlier_s: float, later_s: float) -> int:

@@ -34,7 +34,7 @@ class TruckSystem(NamedTuple):
 
 
 class WheelCourse(NamedTuple):
-    """Where the wheels are and what is under them, at every half step."""
+    """Positions of the wheels and the ground under them, at every half step."""
 
     step_s: float
     span_m: float

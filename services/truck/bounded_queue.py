@@ -11,7 +11,7 @@ from typing import Generic, NamedTuple, TypeVar
 ItemT = TypeVar("ItemT")
 
 
-class Dropped(NamedTuple):
+class DroppedItems(NamedTuple):
     """Items that were displaced or too large."""
 
     messages: int
@@ -26,7 +26,7 @@ class BoundedQueue(Generic[ItemT]):
         self._most_bytes = most_bytes
         self._items: deque[tuple[ItemT, int]] = deque()
         self._waiting_bytes = 0
-        self._dropped = Dropped(0, 0)
+        self._dropped = DroppedItems(0, 0)
         self._lock = threading.Lock()
 
     def put(self, item: ItemT, size_bytes: int) -> None:
@@ -51,10 +51,10 @@ class BoundedQueue(Generic[ItemT]):
             self._waiting_bytes -= size_bytes
             return item
 
-    def dropped(self) -> Dropped:
+    def dropped(self) -> DroppedItems:
         """Return the items dropped since the last call."""
         with self._lock:
-            dropped, self._dropped = self._dropped, Dropped(0, 0)
+            dropped, self._dropped = self._dropped, DroppedItems(0, 0)
             return dropped
 
     def __len__(self) -> int:
@@ -62,4 +62,4 @@ class BoundedQueue(Generic[ItemT]):
 
     def _drop(self, size_bytes: int) -> None:
         messages, before_bytes = self._dropped
-        self._dropped = Dropped(messages + 1, before_bytes + size_bytes)
+        self._dropped = DroppedItems(messages + 1, before_bytes + size_bytes)

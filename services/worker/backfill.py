@@ -25,7 +25,7 @@ from services.finding.stays import Passage, are_one, overlap
 from services.identification.engine import Engine
 from services.identification.known import CrossingRecord
 from services.identification.outputs import EngineOutput
-from services.identification.waiting import FromRecording
+from services.identification.waiting import CrossingFromRecording
 from services.ledger.crossing_log import Ledger
 from services.ledger.recorded_crossings import (
     AROUND_NS,
@@ -85,7 +85,7 @@ class Backfill:
         """Stays without a known result."""
         self._fetching: tuple[_MissingStay, ...] = ()
         self._is_final = False
-        self._found: deque[tuple[RecordedStay, FromRecording]] = deque()
+        self._found: deque[tuple[RecordedStay, CrossingFromRecording]] = deque()
         self._given_up: set[RecordedStay] = set()
         self._later: dict[RecordedStay, int] = {}
         """Stays with missing data, with the number of scans up to then."""
@@ -295,7 +295,7 @@ class Backfill:
             for known in self._ledger.about(realm, stay.vehicle, stay.bridge)
         )
 
-    def _others(self, found: FromRecording) -> Iterable[str]:
+    def _others(self, found: CrossingFromRecording) -> Iterable[str]:
         """Return the other trucks on the bridge, as their recordings show."""
         data = found.pending.work.data
         return {

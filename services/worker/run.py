@@ -29,7 +29,7 @@ from services.execution.hang_watchdog import TaskLimits
 from services.execution.offline import header_of
 from services.execution.processes import ProcessExecutor
 from services.history.validation_files import passed_validations
-from services.identification.bridge_state import Fusing
+from services.identification.bridge_state import FusionSettings
 from services.identification.engine import Engine
 from services.identification.known import search_hash
 from services.identification.methods import METHODS
@@ -164,7 +164,7 @@ def _search(asked: WorkerSettings) -> Search:
     site = parse_site(text, str(asked.site))
     settings = IdentificationSettings.model_validate({"method": asked.search_method})
     header = header_of(site, settings, time.time())
-    fusing = Fusing(baselines_of(site, asked.site.parent), threads=settings.threads)
+    fusing = FusionSettings(baselines_of(site, asked.site.parent), threads=settings.threads)
     certificates = asked.certificates or asked.folder / "certificates"
     return Search(asked.site, text, site, settings, header, fusing, certificates)
 

@@ -23,7 +23,7 @@ from schemas.topics import Message
 from services.bus.publisher import Publisher
 from services.common.errors import FailureError
 from services.execution.dispatch import CrossingExecutor, dispatch
-from services.identification.bridge_state import Fusing
+from services.identification.bridge_state import FusionSettings
 from services.identification.engine import Engine
 from services.identification.outputs import EngineOutput, Output
 from services.ledger.runs import EarlierRuns, ResultFiles
@@ -44,7 +44,7 @@ class Search(NamedTuple):
     site: Site
     settings: IdentificationSettings
     header: ResultHeader
-    fusing: Fusing
+    fusing: FusionSettings
     certificates: Path
     """Folder of validation records."""
 

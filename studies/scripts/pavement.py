@@ -59,7 +59,7 @@ class Case(NamedTuple):
         return f"{self.tyres} deck {deck:g} joints {1e3 * joint:g} anisotropy {anisotropy:g}"
 
 
-class Linearised(NamedTuple):
+class LinearEstimate(NamedTuple):
     """Estimate of the elements, linear in 1/EI about the truth."""
 
     z: NDArray[np.float64]
@@ -79,7 +79,9 @@ def simulated(case: Case, seed: int) -> SimulatedCrossing:
     return drive(site, truth, of_noise)
 
 
-def linearised(at: PosteriorAtTruth, pavement: BridgePavement | None) -> tuple[Linearised, float]:
+def linearised(
+    at: PosteriorAtTruth, pavement: BridgePavement | None
+) -> tuple[LinearEstimate, float]:
     """Return the estimate with this mismatch on the bridge, and its ratio to that of the road.
 
     The mismatch off the bridge is estimated in any case, that on it if it is None.
@@ -96,7 +98,7 @@ def linearised(at: PosteriorAtTruth, pavement: BridgePavement | None) -> tuple[L
     std = np.sqrt(np.diag(covariance))[where.elements]
     used = problem.mismatch.pavement
     ratio = 1.0 if used is None else float(np.exp(used.ratio_and_tilt[0]))
-    return Linearised(error[where.elements] / std, std / centre[where.elements]), ratio
+    return LinearEstimate(error[where.elements] / std, std / centre[where.elements]), ratio
 
 
 def at_the_truth(case: Case, seed: int) -> Record:

@@ -14,7 +14,7 @@ from schemas.site import Vehicle
 from services.cli.main import main
 from services.identification.bridge_state import (
     NOTHING_STORED,
-    Fusing,
+    FusionSettings,
     RecentCrossings,
     add_crossings,
     state_of,
@@ -73,7 +73,7 @@ def test_a_truck_of_another_make_is_named_by_its_own_crossing(
     assert Reason.IMPLAUSIBLE_VEHICLE in foreign.reasons
     assert left_out(fused(ten)) == {foreign.crossing_id: LeftOutReason.SUSPECT}
     # Whoever wants suspect crossings too does not get this one.
-    assert left_out(fused(ten, Fusing(with_suspect=True))) == {
+    assert left_out(fused(ten, FusionSettings(with_suspect=True))) == {
         foreign.crossing_id: LeftOutReason.DISAGREES
     }
 
@@ -119,7 +119,7 @@ def with_one(crossings: tuple[CrossingResult, ...], foreign: int) -> list[Crossi
     return [one for number, one in enumerate(crossings) if number not in others]
 
 
-def fused(crossings: list[CrossingResult], fusing: Fusing = NOTHING_STORED) -> BridgeResult:
+def fused(crossings: list[CrossingResult], fusing: FusionSettings = NOTHING_STORED) -> BridgeResult:
     """As `driveby fuse` does."""
     counted = add_crossings(
         RecentCrossings(), [one for one in map(usable, crossings) if one is not None]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.common.errors import InputError
-from services.drives.tables.columns import Placed, column_number
+from services.drives.tables.columns import ColumnChoice, column_number
 from services.drives.tables.dialect import Sheet, is_number
 from services.drives.tables.mapping import ColumnMap, FileMap
 
@@ -59,7 +59,7 @@ def _degrees(match: re.Match[str]) -> float:
 
 
 def sides_of(
-    sheet: Sheet, given: FileMap, placed: Mapping[str, Placed]
+    sheet: Sheet, given: FileMap, placed: Mapping[str, ColumnChoice]
 ) -> dict[str, tuple[int | str, Floats]]:
     """Return column and signs (n,) of the hemispheres, of latitude and longitude with one.
 

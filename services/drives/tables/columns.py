@@ -69,7 +69,7 @@ _FILLERS: Final = frozenset(
 )
 
 
-class Placed(NamedTuple):
+class ColumnChoice(NamedTuple):
     """Column of a quantity, from 0, the unit in its header, and the reason for the choice."""
 
     column: int
@@ -80,7 +80,7 @@ class Placed(NamedTuple):
 
 def placed_columns(
     sheet: Sheet, given: FileMap, channels: Sequence[str]
-) -> tuple[dict[str, Placed], list[str]]:
+) -> tuple[dict[str, ColumnChoice], list[str]]:
     """Return the column of each quantity, and the names of unused columns.
 
     Columns of a table without known names are assigned by their order if their number fits: a time
@@ -101,9 +101,11 @@ def placed_columns(
     return found, unused
 
 
-def _candidates(sheet: Sheet, channels: Sequence[str], taken: set[int]) -> dict[str, list[Placed]]:
+def _candidates(
+    sheet: Sheet, channels: Sequence[str], taken: set[int]
+) -> dict[str, list[ColumnChoice]]:
     """Return the columns that a quantity may be by their names, those with exact names alone."""
-    found: dict[str, list[Placed]] = {}
+    found: dict[str, list[ColumnChoice]] = {}
     for column, head in enumerate(sheet.header):
         if column in taken or not sheet.has_cells(column):
             continue
@@ -112,14 +114,16 @@ def _candidates(sheet: Sheet, channels: Sequence[str], taken: set[int]) -> dict[
             unit = sheet.units[column]
         quantity, why = _quantity(head, name, channels)
         if quantity is not None:
-            found.setdefault(quantity, []).append(Placed(column, unit, why))
+            found.setdefault(quantity, []).append(ColumnChoice(column, unit, why))
     for quantity, several in found.items():
         exact = [one for one in several if one.why == "exact"]
         found[quantity] = exact or several
     return found
 
 
-def _only(sheet: Sheet, quantity: str, several: list[Placed], channels: Sequence[str]) -> Placed:
+def _only(
+    sheet: Sheet, quantity: str, several: list[ColumnChoice], channels: Sequence[str]
+) -> ColumnChoice:
     """Return the one column that a quantity is; InputError where several accelerations may be."""
     if len(several) > 1 and quantity in channels:
         upward = [one for one in several if set(_words(sheet.header[one.column])) & _VERTICAL]
@@ -133,14 +137,14 @@ def _only(sheet: Sheet, quantity: str, several: list[Placed], channels: Sequence
     return several[0]
 
 
-def _counter(sheet: Sheet, found: dict[str, Placed]) -> dict[str, Placed]:
+def _counter(sheet: Sheet, found: dict[str, ColumnChoice]) -> dict[str, ColumnChoice]:
     """Return a column that counts samples, or whose name begins with a word for time."""
     used = {one.column for one in found.values()}
     heads = [(n, _words(unit_in(h)[0])) for n, h in enumerate(sheet.header) if n not in used]
     times = [n for n, words in heads if words and words[0] in _WORDS[TIME].split()]
     counters = [n for n, words in heads if words and "".join(words) in _COUNTERS]
     chosen = (times + counters)[:1]
-    return {TIME: Placed(chosen[0], _head_unit(sheet, chosen[0]), "name")} if chosen else {}
+    return {TIME: ColumnChoice(chosen[0], _head_unit(sheet, chosen[0]), "name")} if chosen else {}
 
 
 def column_number(sheet: Sheet, column: ColumnName, key: str) -> int:
@@ -159,7 +163,7 @@ def column_number(sheet: Sheet, column: ColumnName, key: str) -> int:
     return sheet.header.index(column)
 
 
-def _given(sheet: Sheet, given: FileMap, channels: Sequence[str]) -> dict[str, Placed]:
+def _given(sheet: Sheet, given: FileMap, channels: Sequence[str]) -> dict[str, ColumnChoice]:
     """Return the columns that the map names."""
     known = (*POSITION_COLUMNS, *channels)
     found = {}
@@ -171,10 +175,10 @@ def _given(sheet: Sheet, given: FileMap, channels: Sequence[str]) -> dict[str, P
             )
         if one.column is not None:
             number = column_number(sheet, one.column, f"columns.{quantity}")
-            found[quantity] = Placed(number, _head_unit(sheet, number), "given")
+            found[quantity] = ColumnChoice(number, _head_unit(sheet, number), "given")
         elif quantity in sheet.header:
             number = sheet.header.index(quantity)
-            found[quantity] = Placed(number, _head_unit(sheet, number), "exact")
+            found[quantity] = ColumnChoice(number, _head_unit(sheet, number), "exact")
     for quantity, column in (
         (TIME, given.time.column),
         (DATE, given.time.date_column),
@@ -182,7 +186,7 @@ def _given(sheet: Sheet, given: FileMap, channels: Sequence[str]) -> dict[str, P
     ):
         if column is not None:
             number = column_number(sheet, column, f"time of {quantity}")
-            found[quantity] = Placed(number, _head_unit(sheet, number), "given")
+            found[quantity] = ColumnChoice(number, _head_unit(sheet, number), "given")
     return found
 
 
@@ -223,7 +227,9 @@ def _quantity(head: str, name: str, channels: Sequence[str]) -> tuple[str | None
     return None, ""
 
 
-def _by_order(sheet: Sheet, found: dict[str, Placed], channels: Sequence[str]) -> dict[str, Placed]:
+def _by_order(
+    sheet: Sheet, found: dict[str, ColumnChoice], channels: Sequence[str]
+) -> dict[str, ColumnChoice]:
     """Return columns by their order; InputError if their number does not fit."""
     used = {one.column for one in found.values()}
     free = [column for column in range(sheet.width) if column not in used]
@@ -241,7 +247,7 @@ def _by_order(sheet: Sheet, found: dict[str, Placed], channels: Sequence[str]) -
             "[file.columns] of a map (--map), or skip = true in its [[file]]"
         )
     return {
-        name: Placed(column, _head_unit(sheet, column), "order")
+        name: ColumnChoice(column, _head_unit(sheet, column), "order")
         for name, column in zip(wanted, free, strict=False)
     }
 

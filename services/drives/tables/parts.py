@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from services.common.errors import InputError
 from services.drives.tables.angles import SIDES, angles, sides_of
-from services.drives.tables.columns import DATE, TIME, WEEK, Placed, placed_columns, words_of
+from services.drives.tables.columns import DATE, TIME, WEEK, ColumnChoice, placed_columns, words_of
 from services.drives.tables.dates import (
     date_times,
     is_compact,
@@ -57,7 +57,7 @@ class TablePart(NamedTuple):
     """Map of the file as given."""
     found: FileMap
     """Map of the file with all findings, but for units and gravity."""
-    placed: dict[str, Placed]
+    placed: dict[str, ColumnChoice]
     times: Times
     columns: dict[str, Floats]
     """Numbers as in the file (n,), NaN where a cell is empty, by quantity."""
@@ -130,7 +130,7 @@ def _numbers(sheet: Sheet, quantity: str, column: int, given: FileMap) -> Floats
     return values if factor is None else values * factor
 
 
-def _check_headers(sheet: Sheet, placed: dict[str, Placed], given: FileMap) -> None:
+def _check_headers(sheet: Sheet, placed: dict[str, ColumnChoice], given: FileMap) -> None:
     """Raise InputError for an acceleration in a converter's unit without a factor."""
     for quantity, one in placed.items():
         own = given.columns.get(quantity, ColumnMap())
@@ -154,7 +154,7 @@ def _is_given(dialect: Dialect, given: FileMap) -> bool:
     return all(getattr(given, key) == value for key, value in zip(keys, dialect, strict=True))
 
 
-def _found(sheet: Sheet, given: FileMap, placed: dict[str, Placed], times: Times) -> FileMap:
+def _found(sheet: Sheet, given: FileMap, placed: dict[str, ColumnChoice], times: Times) -> FileMap:
     """Return the map with all findings on text, columns and times."""
     dialect = sheet.dialect
 
@@ -199,7 +199,7 @@ def _found(sheet: Sheet, given: FileMap, placed: dict[str, Placed], times: Times
 def _times(
     sheet: Sheet,
     given: TimeMap,
-    placed: dict[str, Placed],
+    placed: dict[str, ColumnChoice],
     declared_hz: float,
     zone: tzinfo | None,
     guesses: list[Guess],
@@ -253,7 +253,7 @@ def _times(
     return times
 
 
-def _times_of_weeks(sheet: Sheet, given: TimeMap, placed: dict[str, Placed]) -> Times | None:
+def _times_of_weeks(sheet: Sheet, given: TimeMap, placed: dict[str, ColumnChoice]) -> Times | None:
     """Return the times of GPS weeks and the seconds in them; None for other times."""
     head = words_of(sheet, placed[TIME].column)
     if WEEK in placed or given.week is not None:

@@ -11,7 +11,7 @@ import numpy as np
 from schemas.results import BridgeResult, CrossingResult
 from schemas.settings import IdentificationSettings
 from services.finding.crossing_data import CrossingData
-from services.identification.bridge_state import Fusing, RecentCrossings
+from services.identification.bridge_state import FusionSettings, RecentCrossings
 from tests.identifications import Identifications
 from tests.waiting import LONGEST_S
 
@@ -89,24 +89,24 @@ def sleep_at_the_second_start() -> None:
 STATE = BridgeResult(verdict="rejected")  # type: ignore[call-arg]
 
 
-def named_by_number(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
+def named_by_number(counted: RecentCrossings, bridge: str, fusing: FusionSettings) -> BridgeResult:
     """Record which process made it of what, and when."""
     (Path(os.environ["DEADLY_ONCE"]) / f"{time.monotonic_ns()} {bridge} {counted.number}").touch()
     return STATE.model_copy(update={"crossings_left_out_count": counted.number})
 
 
-def after_a_signal(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
+def after_a_signal(counted: RecentCrossings, bridge: str, fusing: FusionSettings) -> BridgeResult:
     state = named_by_number(counted, bridge, fusing)
     wait_for(str(Path(os.environ["DEADLY_ONCE"]) / "go on"))
     return state
 
 
-def dies(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
+def dies(counted: RecentCrossings, bridge: str, fusing: FusionSettings) -> BridgeResult:
     os.kill(os.getpid(), signal.SIGKILL)
     raise AssertionError
 
 
-def dies_once(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
+def dies_once(counted: RecentCrossings, bridge: str, fusing: FusionSettings) -> BridgeResult:
     mark = Path(os.environ["DEADLY_ONCE"]) / "died"
     if not mark.exists():
         mark.touch()
@@ -114,12 +114,12 @@ def dies_once(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeRe
     return named_by_number(counted, bridge, fusing)
 
 
-def for_ever(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
+def for_ever(counted: RecentCrossings, bridge: str, fusing: FusionSettings) -> BridgeResult:
     time.sleep(1e6)
     raise AssertionError
 
 
-def bad(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
+def bad(counted: RecentCrossings, bridge: str, fusing: FusionSettings) -> BridgeResult:
     raise np.linalg.LinAlgError("singular")
 
 

@@ -11,7 +11,7 @@ import pytest
 from services.common.errors import FailureError
 from services.execution import cluster
 from services.execution.cluster import DaskExecutor
-from services.execution.cluster_worker import BatchRefused, packed, unpacked
+from services.execution.cluster_worker import BatchRefusal, packed, unpacked
 from services.execution.dispatch import TaskResult, failed_result
 from services.execution.scheduler import Scheduler, connect, threads_of
 from services.identification.outputs import IdentificationTask
@@ -26,13 +26,13 @@ class Future:
 
     def __init__(self, batch: bytes) -> None:
         self.status: Literal["pending", "finished", "lost", "cancelled"] = "finished"
-        self.given: bytes | BatchRefused | None = packed(
+        self.given: bytes | BatchRefusal | None = packed(
             failed_result(work) for work in unpacked(batch)
         )
         """None: it does not come."""
         self.asked = 0
 
-    def result(self, timeout: float) -> bytes | BatchRefused:
+    def result(self, timeout: float) -> bytes | BatchRefusal:
         self.asked += 1
         if self.given is None:
             raise TimeoutError
@@ -147,7 +147,7 @@ def test_a_worker_that_is_refused_may_have_gone_by_itself(clients: list[Client])
     with DaskExecutor(ADDRESS, batch=len(given)) as on:
         for work in given:
             on.submit(work)
-        first.sent[0].given = BatchRefused("tcp://127.0.0.1:1", "has driveby 0.0.9")
+        first.sent[0].given = BatchRefusal("tcp://127.0.0.1:1", "has driveby 0.0.9")
         assert is_each_once(all_of(on), given)
     assert len(first.sent) == 2
 

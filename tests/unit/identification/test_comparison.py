@@ -206,7 +206,7 @@ def test_of_elements_that_trade_with_each_other_nothing_is_taken_for_common() ->
 LEVEL = ElementState(mean=0.9, std=0.09, q025=0.75, q975=1.08)
 
 
-def test_unresolved_elements_are_never_said_to_agree() -> None:
+def test_unresolved_elements_are_never_stated_to_agree() -> None:
     found = compared()
     assert describe_comparison(found) == sentences(found)
     assert describe_comparison(found, frozenset({1, 5}), LEVEL) == [

@@ -19,7 +19,7 @@ from schemas.results import (
 from services.cli.main import main
 from services.identification.bridge_state import (
     NOTHING_STORED,
-    Fusing,
+    FusionSettings,
     RecentCrossings,
     States,
     add_crossings,
@@ -126,7 +126,7 @@ def crossing(
     )
 
 
-def state(crossings: list[CrossingResult], fusing: Fusing = NOTHING_STORED) -> BridgeResult:
+def state(crossings: list[CrossingResult], fusing: FusionSettings = NOTHING_STORED) -> BridgeResult:
     counted = add_crossings(
         RecentCrossings(), [one for one in map(usable, crossings) if one is not None]
     )
@@ -197,7 +197,7 @@ def test_another_nominal_value_is_the_same_bridge() -> None:
 
 def test_probabilities_of_loss_are_against_a_baseline() -> None:
     before = state([crossing(n, (1.0,) * ELEMENTS) for n in range(6)])
-    now = state([crossing(n) for n in range(10, 16)], Fusing({"bridge-1": before}))
+    now = state([crossing(n) for n in range(10, 16)], FusionSettings({"bridge-1": before}))
     assert now.probability_of_loss is not None
     lost = now.probability_of_loss["EI_3"]
     assert lost["10"] == lost["20"] == lost["30"] == 1.0

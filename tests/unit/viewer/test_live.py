@@ -258,7 +258,7 @@ def test_a_result_is_drawn_and_the_next_takes_its_place(live: Live, site: Site) 
     assert "No element differs clearly from the others" in texts[2]
 
 
-def test_unresolved_elements_of_a_result_are_not_said_to_be_alike(live: Live, site: Site) -> None:
+def test_unresolved_elements_of_a_result_are_not_called_alike(live: Live, site: Site) -> None:
     wide = results_of(site, some_crossing("a"), ratios=np.ones(7)).crossings[0]
     content = wide.model_dump(mode="json")
     for n in (1, 7):
