@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.common.errors import InputError
+from services.common.language import utc_day
 from services.drives.tables.findings import Findings, Target
 from services.drives.tables.parts import TablePart
 from services.drives.tables.stamps import start_of, to_utc, zone_of
@@ -34,7 +35,7 @@ def begins(
         where = str(part.sheet.path)
         add_s[part.name] = given_time.offset_s or 0.0
         if part.times.is_relative:
-            add_s[part.name] += _start(part, run, runs, target, found)
+            add_s[part.name] += _start(part, run, runs, target, found, _day_of(zoned))
         elif part.times.needs_zone and target.zone is None and given_time.zone is None:
             if not any(_overlap(part, other) for other in zoned):
                 raise InputError(
@@ -56,8 +57,16 @@ def begins(
     return add_s
 
 
-def _start(part: TablePart, run: str, runs: int, target: Target, found: Findings) -> float:
-    """Return the start of a drive whose times count from it."""
+def _day_of(parts: Sequence[TablePart]) -> str | None:
+    """Return the day, UTC, of files that have dates; None without any."""
+    first_s = [float(np.nanmin(part.times.time_s)) for part in parts]
+    return utc_day(first_s[0]) if first_s else None
+
+
+def _start(
+    part: TablePart, run: str, runs: int, target: Target, found: Findings, day: str | None
+) -> float:
+    """Return the start of a drive whose times count from it; `day` is that of its other files."""
     given_time = part.given.time.start
     first_s = float(np.nanmin(part.times.time_s))
     if isinstance(given_time, dict):
@@ -70,9 +79,12 @@ def _start(part: TablePart, run: str, runs: int, target: Target, found: Findings
         several = 'of each run in [file.time] of a map, start = { 01 = "…" } (--map)'
         how = several if runs > 1 else "with --start 2026-05-01T09:30:00+02:00"
         if part.times.format == "clock" and first_s > _LONG_S:
+            midnight = "2026-05-01T00:00:00+02:00"
+            if day is not None:
+                midnight = f"{day}T00:00:00Z (in UTC; or with the receiver's zone for Z)"
             raise InputError(
                 f"{part.sheet.path}: times of day have no date: give the midnight before them "
-                "with --start 2026-05-01T00:00:00+02:00"
+                f"with --start {midnight}"
             )
         ahead = "" if first_s < _LONG_S else f" (its first row is {first_s:.0f} s after it)"
         noted = "" if part.sheet.start_text is None else f'; the file has "{part.sheet.start_text}"'

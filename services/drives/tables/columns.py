@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.common.errors import InputError
-from services.drives.tables.dialect import Sheet
+from services.drives.tables.dialect import Sheet, is_number
 from services.drives.tables.mapping import POSITION_COLUMNS, ColumnName, FileMap
 from services.drives.tables.units import unit_in
 
@@ -67,6 +67,12 @@ _FILLERS: Final = frozenset(
         "seconds",
     ]
 )
+
+
+_JOINS: Final = frozenset(["und", "and", "et", "y", "e", "en"])
+_DAY: Final = re.compile(r"\d{1,4}[-./]\w{1,9}[-./]\d{1,4}")
+_FEWEST_S: Final = 9e8
+"""Smallest number of seconds since 1970 of a drive; numbers from a start are smaller."""
 
 
 class ColumnChoice(NamedTuple):
@@ -134,7 +140,17 @@ def _only(
                 "(--map)"
             )
         several = upward
+    if quantity == TIME:
+        return next((one for one in several if _is_absolute(sheet, one.column)), several[0])
     return several[0]
+
+
+def _is_absolute(sheet: Sheet, column: int) -> bool:
+    """Return whether a column has dates, or numbers as large as those since 1970."""
+    first = next((text for text in sheet.texts(column) if text), "")
+    if _DAY.search(first):
+        return True
+    return is_number(first) and abs(float(sheet.values(column)[0])) > _FEWEST_S
 
 
 def _counter(sheet: Sheet, found: dict[str, ColumnChoice]) -> dict[str, ColumnChoice]:
@@ -142,6 +158,7 @@ def _counter(sheet: Sheet, found: dict[str, ColumnChoice]) -> dict[str, ColumnCh
     used = {one.column for one in found.values()}
     heads = [(n, _words(unit_in(h)[0])) for n, h in enumerate(sheet.header) if n not in used]
     times = [n for n, words in heads if words and words[0] in _WORDS[TIME].split()]
+    times.sort(key=lambda column: not _is_absolute(sheet, column))
     counters = [n for n, words in heads if words and "".join(words) in _COUNTERS]
     chosen = (times + counters)[:1]
     return {TIME: ColumnChoice(chosen[0], _head_unit(sheet, chosen[0]), "name")} if chosen else {}
@@ -208,6 +225,8 @@ def _quantity(head: str, name: str, channels: Sequence[str]) -> tuple[str | None
     words_used = [word for word in words if word not in _FILLERS] or words
     if not words_used:
         return None, ""
+    if _has_date_and_time(words):
+        return TIME, "name"
     for quantity, known in _WORDS.items():
         if "".join(words_used) in known.split() or (
             len(words_used) == 1 and words_used[0] in known.split()
@@ -225,6 +244,13 @@ def _quantity(head: str, name: str, channels: Sequence[str]) -> tuple[str | None
         if channel in channels:
             return channel, "name"
     return None, ""
+
+
+def _has_date_and_time(words: Sequence[str]) -> bool:
+    """Return whether a name is of both, such as Date/Time or Datum und Uhrzeit."""
+    dates, times = set(_WORDS[DATE].split()), set(_WORDS[TIME].split())
+    named = set(words)
+    return bool(named & dates and named & times) and named <= dates | times | _JOINS | _FILLERS
 
 
 def _by_order(

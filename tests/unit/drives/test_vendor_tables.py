@@ -100,6 +100,13 @@ def dates(columns: Columns, form: str, shift_h: float = 0.0) -> dict[str, Any]:
     return with_times(columns, [text(s) for s in columns["time_s"]])
 
 
+def counted_from_0(columns: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return the columns behind one of seconds from the start, their own times under a name."""
+    other = {one: values for one, values in columns.items() if one != "time_s"}
+    seconds = np.arange(len(columns["time_s"])) / 100.0
+    return {"Zeit rel. [s]": seconds, name: columns["time_s"]} | other
+
+
 def scaled(factor: float, offset: float = 0.0, names: tuple[str, ...] = CHANNELS) -> Columns:
     return {n: v * factor + offset if n in names else v for n, v in ACCEL.items()}
 
@@ -265,6 +272,17 @@ VARIANTS: dict[str, Variant] = {
             P: table(dates(GPS, GERMAN, 2.0), ";", ","),
         },
         how=HowToRead(zone="Europe/Berlin"),
+    ),
+    "dates beside a count from 0": Variant(
+        lambda: {
+            A: table(counted_from_0(dates(ACCEL, GERMAN, 2.0), "Datum/Uhrzeit"), ";", ","),
+            P: table(counted_from_0(dates(GPS, GERMAN, 2.0), "Datum und Zeit"), ";", ","),
+        },
+        how=HowToRead(zone="Europe/Berlin"),
+        note="not used: Zeit rel. [s]",
+    ),
+    "Unix times beside a count from 0": Variant(
+        lambda: pair(counted_from_0(ACCEL, "Timestamp (UTC)")), note="not used: Zeit rel. [s]"
     ),
     "ISO 8601 with an offset": Variant(
         lambda: {A: table(dates(ACCEL, ISO + "+01:00", 1.0)), P: table(dates(GPS, ISO + "Z"))}
@@ -866,6 +884,10 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, str | bytes]], str]] = {
     "times of day without a date": (
         lambda: {A: table(dates(ACCEL, "%H:%M:%S.%f")), P: table(dates(GPS, "%H:%M:%S.%f"))},
         "times of day have no date: give the midnight before them with --start",
+    ),
+    "times of day of a receiver beside dates": (
+        lambda: {A: table(dates(ACCEL, ISO + "Z")), P: table(dates(GPS, "%H:%M:%S.%f"))},
+        "give the midnight before them with --start 2026-09-21T00:00:00Z (in UTC; or with",
     ),
     "seconds of the GPS week": (
         lambda: pair(renamed(ACCEL, "TOW [s]", *CHANNELS)),
