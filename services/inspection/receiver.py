@@ -37,8 +37,8 @@ def receiver_of(run: InspectedRun, declared: Receiver) -> Iterator[CheckFinding]
         yield CheckFinding(
             "positions",
             CheckStatus.WRONG,
-            f"{time_s.size} fixes",
-            "check receiver and antenna: crossings are detected by the positions",
+            f"{time_s.size} fixes, at least {_FEWEST_FIXES} are needed here",
+            "record longer, or check receiver and antenna: crossings are detected by the positions",
         )
         return
     apart_s = float(np.median(np.diff(time_s)))

@@ -243,6 +243,17 @@ def test_minute_of_standstill_measures_the_noise(
     assert found["channels_in_place"][0].state is CheckStatus.OPEN
 
 
+def test_few_fixes_are_named_with_the_number_needed(tmp_path: Path) -> None:
+    """A receiver of 1 Hz has some ten in a trial drive of ten seconds."""
+    run = standstill(25.0)
+    few = GnssTrack(*(None if values is None else values[:9] for values in run.gnss))
+    sensor = sound().site.sensor.model_copy(update={"rate_hz": (500.0,) * 4})
+    site = sound().site.model_copy(update={"sensor": sensor})
+    (found,) = findings(tmp_path, run._replace(gnss=few), site)["positions"]
+    assert found.text == "9 fixes, at least 20 are needed here"
+    assert found.advice.startswith("record longer, or check")
+
+
 def test_density_is_that_of_the_noise_whatever_lines_are_on_it() -> None:
     run = standstill(25.0)
     for values in run.channels.values():
