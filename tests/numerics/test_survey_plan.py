@@ -19,6 +19,7 @@ from pre_core.survey.plan import (
 from services.planning.alternatives import with_tyres
 from services.planning.crossings import CrossingSimulator, PlannedCrossing, PlannedRoad, mismatch_of
 from services.simulation.drive import paper_site
+from services.simulation.usual_trucks import usual_tandem
 from studies.validation.bound import bound_of
 
 SITE = paper_site()
@@ -161,3 +162,20 @@ def test_losses_probabilities_and_the_scale() -> None:
     np.testing.assert_allclose(with_scale.of_nominal, 0.02, rtol=2e-3)
     # Against the others a scale that all have does not matter: an element and the mean of two.
     np.testing.assert_allclose(with_scale.of_others, 1e-3 * np.sqrt(1.5), rtol=1e-3)
+
+
+def information_of_tandem(damping_ns_per_m: float) -> np.ndarray:
+    vehicle = usual_tandem(25.0)
+    lead, *behind = vehicle.axles
+    damped = (a.model_copy(update={"tyre_damping_ns_per_m": damping_ns_per_m}) for a in behind)
+    truck = vehicle.model_copy(update={"axles": (lead, *damped)})
+    site = SITE.model_copy(update={"vehicles": (truck,)})
+    simulated_now = CrossingSimulator(PlannedRoad("A", 0.12))
+    crossing = PlannedCrossing(site, 10.0)
+    track, known = simulated_now.track((crossing,)), simulated_now.known(crossing)
+    return of_elements(survey_information([track], 1.0, known.log_odds.size))
+
+
+def test_a_planned_tandem_without_tyre_damping_has_the_median_of_its_prior() -> None:
+    # Its axles would bounce undamped, and the bridge's response to that pass for information.
+    assert (information_of_tandem(1.0) / information_of_tandem(0.0)).max() > 1.5
