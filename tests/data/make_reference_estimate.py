@@ -1,6 +1,6 @@
 """Writes reference_estimate.json: what the engine makes of two stored recordings.
 
-    .venv/bin/python tests/data/make_reference_estimate.py [--print] [sample] [noise_free]
+    .venv/bin/python -m tests.data.make_reference_estimate [--print] [sample] [noise_free]
 
 Run it when a change of the result is meant, for the recordings (all by default) whose result is to
 change, and say in the commit why the numbers moved and how far (`git diff` shows it).

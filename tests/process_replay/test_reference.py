@@ -130,7 +130,8 @@ def as_another_processor(which: str, maker: ModuleType, source: str) -> dict[str
     if missing := set(needed) - set(Path("/proc/cpuinfo").read_text().split()):
         pytest.skip(f"this processor has no {', '.join(sorted(missing))}")
     child = subprocess.run(
-        [sys.executable, str(maker.__file__), "--print", source],
+        [sys.executable, "-m", "tests.data.make_reference_estimate", "--print", source],
+        cwd=Path(str(maker.__file__)).parents[2],
         env={k: v for k, v in os.environ.items() if k != "NUMBA_CPU_FEATURES"} | settings,
         capture_output=True,
         text=True,
