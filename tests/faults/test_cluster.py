@@ -371,7 +371,7 @@ def test_a_crossing_that_ends_every_worker_costs_itself_only(
         options = on(running, into, "--json", str(path))
         first = begin(*of(recordings[:2], *options))
         assert first.wait() == 3, first.output()
-    (name,) = re.findall(r"(\S+): its identification failed", first.output())
+    (name,) = re.findall(r"(\S+): identification failed", first.output())
     assert "T002003" in name
     found = results_of(path)["crossings"]
     failed = [one for one in found if one["reasons"] == ["failed"]]
