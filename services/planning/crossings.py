@@ -181,7 +181,8 @@ def _with_damped_tyres(site: Site) -> Site:
     """Return the site with the median of the prior where damping of a tandem's tyres is zero.
 
     Two axles that share their load bounce in opposite directions without moving their springs.
-    Only the tyres damp that: without damping it shakes the bridge, which shows it in detail.
+    Only the tyres damp that: without damping it shakes the bridge, whose response passes for
+    information.
     """
     vehicle = site.vehicles[0]
     damping = _MEDIAN_OF_HALF_NORMAL * vehicle.scale_at_zero("tyre_damping_ns_per_m")

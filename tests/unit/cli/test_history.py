@@ -125,6 +125,7 @@ def test_a_folder_without_results_is_one_line(
     output = capsys.readouterr().err
     assert output.count("\n") == 1
     assert f"{tmp_path}: has no results, HASH.parquet of driveby identify --into" in output
+    assert "results-TIME.json of driveby worker (in FOLDER/REALM) are expected" in output
     assert not (tmp_path / "history").exists()
 
 
@@ -144,15 +145,6 @@ def test_folder_of_workers_is_added(
     assert first == f"{folder}: 4 crossings of bridge-1 added"
     assert again == f"{folder}: 0 crossings added, 4 there already"
     assert line.startswith(f"{torn}: ")
-
-
-def test_folder_without_results_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert add(tmp_path, tmp_path) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert "results-TIME.json of driveby worker (in FOLDER/REALM) are expected" in error
 
 
 def test_list_of_alarms_of_a_single_bridge(
