@@ -9,8 +9,9 @@ from typing import Any, Final
 from pydantic import BaseModel, ValidationError
 
 from schemas.errors import InputError
-from schemas.site import MAX_ELEMENTS, MAX_TABLES, Bridge, Receiver, Sensor, Site, Vehicle
+from schemas.site import MAX_TABLES, Bridge, Receiver, Sensor, Site, Vehicle
 from schemas.site_axle_tables import Axle, Bogie
+from schemas.site_bridge import MAX_ELEMENTS
 from schemas.site_errors import Tables, all_lines, first_line
 from schemas.site_import import Import
 from schemas.site_ros2 import Ros2

@@ -1,8 +1,8 @@
 """Usual ranges of what a site file implies: frequencies, damping, deflection; and likely slips.
 
-What no truck or bridge can have is refused (`schemas.site_physics`). What is only unlikely is named
-here, with the value that was probably meant: a stiffness in kN/m for N/m, a mass in t, a damping
-ratio for a Rayleigh coefficient.
+What no truck or bridge can have is refused (`site_vehicle`, `site_bridge`). What is only unlikely
+is named here, with the value that was probably meant: a stiffness in kN/m for N/m, a mass in t, a
+damping ratio for a Rayleigh coefficient.
 """
 
 import math

@@ -1,5 +1,6 @@
 """`[vehicle]` of a site file: a truck with its axles, and its accelerometers if it names them."""
 
+import math
 from typing import Annotated, Any, ClassVar, Final
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -18,11 +19,24 @@ from schemas.site_numbers import (
     Table,
     Track,
 )
-from schemas.site_physics import check_vehicle, in_tonnes
+from schemas.site_physics import check
 from schemas.site_sensors import MAX_SENSORS, PlacedSensor, check_places, check_sensors
 from schemas.site_tandem import Tandem, tandem_of
 
 _TYRE_DAMPING_NS_PER_M: Final = 1000.0
+_SMALLEST_MASS_KG: Final = 0.1
+_SMALLEST_AXLE: Final = 1e-3
+"""Smallest share of the truck's mass in one axle, and in the body."""
+_SMALLEST_LOAD: Final = 0.01
+"""Smallest share of the weight on one axle."""
+_SPRING_HZ: Final = (0.1, 300.0)
+"""Natural frequency of the body on an axle's springs; at 0.1 Hz it sags by 25 m under its weight.
+"""
+_TYRE_HZ: Final = (0.1, 1000.0)
+"""Natural frequency: lower bound for the body on the tyres, upper bound for the axle on them."""
+_MAX_DAMPING: Final = 20.0
+"""Largest damping ratio of a suspension and of a tyre."""
+_TYRE_M: Final = (1e-3, 2.0)
 
 
 def _two(value: object) -> object:
@@ -182,7 +196,7 @@ class Vehicle(WithSpreads):
             raise error_at(
                 "unsprung_mass_kg",
                 f"adds up to {sum(self.unsprung_mass_kg)}, it must be a mass less than "
-                f"total_mass_kg, {self.total_mass_kg} kg{in_tonnes(self.total_mass_kg)}",
+                f"total_mass_kg, {self.total_mass_kg} kg{_in_tonnes(self.total_mass_kg)}",
             )
         if self.tandem is not None and not self.sensors:
             raise error_at(
@@ -194,7 +208,7 @@ class Vehicle(WithSpreads):
             behind = (1, 2) if self.tandem is None else (2, 3)
             check_places(self.sensors, self.length_m, self.track_m or ())
             check_sensors(self.sensors, self.wheelbase_m, behind)
-        check_vehicle(self)
+        _check_physics(self)
         return self
 
 
@@ -205,3 +219,68 @@ def axle_loads_kg(vehicle: Vehicle) -> tuple[float, float]:
         vehicle.sprung_mass_kg * (1.0 - share) + vehicle.unsprung_mass_kg[0],
         vehicle.sprung_mass_kg * share + vehicle.unsprung_mass_kg[1],
     )
+
+
+def _check_physics(vehicle: Vehicle) -> None:
+    """Raise an error for the first key whose value no truck can have."""
+    total = vehicle.total_mass_kg
+    check("total_mass_kg", total, (_SMALLEST_MASS_KG, 1e6), "a mass", "kg")
+    wheelbase = vehicle.wheelbase_m
+    check("wheelbase_m", wheelbase, (0.05, 30.0), "a length", "m")
+    check(
+        "front_axle_to_cg_m",
+        vehicle.front_axle_to_cg_m,
+        (_SMALLEST_LOAD * wheelbase, (1.0 - _SMALLEST_LOAD) * wheelbase),
+        "a length",
+        "m",
+        "each axle carries a part of the truck",
+    )
+    check("pitch_inertia_ratio", vehicle.pitch_inertia_ratio, (0.01, 10.0), "a number")
+    for k, mass in enumerate(vehicle.unsprung_mass_kg):
+        limits = (_SMALLEST_AXLE * total, (1.0 - _SMALLEST_AXLE) * total)
+        check(f"unsprung_mass_kg.{k}", mass, limits, "a mass", "kg", f"the truck has {total:g} kg")
+    if vehicle.sprung_mass_kg < _SMALLEST_AXLE * total:
+        raise error_at(
+            "unsprung_mass_kg",
+            f"adds up to {sum(vehicle.unsprung_mass_kg):g}, it must be a mass of at most "
+            f"{(1.0 - _SMALLEST_AXLE) * total:g} kg: a part of the truck is on springs",
+        )
+    loads = (vehicle.cg_to_rear_axle_m / wheelbase, vehicle.front_axle_to_cg_m / wheelbase)
+    for k in range(2):
+        _check_axle(vehicle, k, vehicle.sprung_mass_kg * loads[k])
+    for key in ("tyre_width_m", "tyre_contact_length_m"):
+        for k, value in enumerate(getattr(vehicle, key) or ()):
+            check(f"{key}.{k}", value, _TYRE_M, "a length", "m")
+    for k, value in enumerate(vehicle.twin_tyre_distance_m or ()):
+        check(f"twin_tyre_distance_m.{k}", value, (0.0, _TYRE_M[1]), "a length", "m")
+    for k, value in enumerate(vehicle.track_m or ()):
+        check(f"track_m.{k}", value, (0.02, 5.0), "a length", "m")
+
+
+def _check_axle(vehicle: Vehicle, k: int, body_kg: float) -> None:
+    """Raise if springs, tyres or dampers of an axle that carries `body_kg` are impossible."""
+    axle_kg = vehicle.unsprung_mass_kg[k]
+    spring, tyre = vehicle.suspension_stiffness_n_per_m[k], vehicle.tyre_stiffness_n_per_m[k]
+    low, high = (_stiffness(body_kg, hz) for hz in _SPRING_HZ)
+    because = f"{body_kg:.3g} kg swing on it at {_SPRING_HZ[0]:g} to {_SPRING_HZ[1]:g} Hz"
+    key = f"suspension_stiffness_n_per_m.{k}"
+    check(key, spring, (low, high), "a stiffness", "N/m", because)
+    low, high = _stiffness(body_kg, _TYRE_HZ[0]), _stiffness(axle_kg, _TYRE_HZ[1])
+    because = f"an axle of {axle_kg:.3g} kg swings on it at {_TYRE_HZ[1]:g} Hz at most"
+    check(f"tyre_stiffness_n_per_m.{k}", tyre, (low, high), "a stiffness", "N/m", because)
+    because = f"the damping ratio is {_MAX_DAMPING:g} then"
+    for key, damping, stiffness, mass in (
+        ("suspension_damping_ns_per_m", vehicle.suspension_damping_ns_per_m[k], spring, body_kg),
+        ("tyre_damping_ns_per_m", vehicle.tyre_damping_ns_per_m[k], tyre, axle_kg),
+    ):
+        most = 2.0 * _MAX_DAMPING * math.sqrt(stiffness * mass)
+        check(f"{key}.{k}", damping, (0.0, most), "a damping", "N·s/m", because)
+
+
+def _in_tonnes(mass_kg: float) -> str:
+    """Return a hint that a mass of a truck may be in t; empty where it may not."""
+    return f"; in t? then it is {1e3 * mass_kg:g}" if 1.0 <= mass_kg <= 100.0 else ""
+
+
+def _stiffness(mass_kg: float, frequency_hz: float) -> float:
+    return mass_kg * (2.0 * math.pi * frequency_hz) ** 2
