@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from schemas.results import Results, load_results, results_json
 from services.cli.bridge_table import print_bridge
-from services.cli.commands.fuse import FuseOptions
 from services.cli.identify import warn_of_shared_crossings
+from services.cli.settings import FuseOptions
 from services.common.errors import InputError
 from services.common.files import check_writable, write_atomically
 from services.common.progress import Steps, parts_bar, steps_bar

@@ -1,4 +1,4 @@
-"""Options of `driveby identify`."""
+"""Options of `driveby identify` and `driveby fuse`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,3 +79,17 @@ class IdentifyOptions:
     def search_method(self) -> str:
         """Name of the method in settings and results."""
         return self.method.replace("-", "_")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FuseOptions:
+    """Options of `driveby fuse`: results to fuse, and outputs."""
+
+    results: tuple[Path, ...] = positional(
+        "results files to fuse", Path, nargs="+", metavar="RESULTS.json"
+    )
+    json: Path | None = output_option(
+        "JSON file of all crossings and the fused estimates", "OUT.json", RESULTS
+    )
+    baseline: Path | None = baseline_option()
+    fuse_suspect: bool = fuse_suspect_option()
