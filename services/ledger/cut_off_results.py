@@ -13,6 +13,7 @@ from typing import Final
 
 from services.common.errors import FailureError, InputError
 from services.common.files import sync
+from services.ledger.worker_results import files_of_workers
 from services.recordings.recording import is_being_written, is_closed
 from services.recordings.recovery import describe, put_aside, recover_recording
 
@@ -33,7 +34,7 @@ def recover_cut_off_results(folder: Path) -> None:
         if _INCOMPLETE.fullmatch(path.name) and path.is_file():
             path.unlink(missing_ok=True)
             _log.info("%s: removed, a killed worker had not completed it", path)
-    for path in sorted(folder.glob("results-*.mcap")):
+    for path in files_of_workers(folder, "mcap"):
         try:
             if not is_being_written(path) and not is_closed(path):
                 _complete(path)

@@ -32,6 +32,7 @@ from services.identification.bridge_state import (
 from services.identification.known import CrossingRecord, search_hash
 from services.ledger.crossing_log import CrossingLog, PublishedResult
 from services.ledger.growing_json import AppendableResults
+from services.ledger.worker_results import files_of_workers
 from services.recordings.recording import is_being_written, read_info, read_messages
 from services.recordings.recovery import NOT_FINISHED
 from services.recordings.writer import RecordingOrigin, RecordingWriter
@@ -272,7 +273,7 @@ def read_earlier(
 
 
 def _runs(folder: Path, now_s: float, age_s: float) -> Iterator[_Run]:
-    for path in sorted(folder.glob("results-*.mcap")):
+    for path in files_of_workers(folder, "mcap"):
         try:
             if now_s - path.stat().st_mtime > age_s:
                 continue

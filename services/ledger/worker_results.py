@@ -7,9 +7,9 @@ from schemas.results import Results, load_results
 from services.common.errors import InputError
 
 
-def files_of_workers(folder: Path) -> list[Path]:
-    """Return the results files of all runs of workers in a folder, in the order of the runs."""
-    return sorted(folder.glob("results-*.json"))
+def files_of_workers(folder: Path, ending: str = "json") -> list[Path]:
+    """Return the results of all runs of workers in a folder, in the order of the runs."""
+    return sorted(folder.glob(f"results-*.{ending}"))
 
 
 def results_of_workers(folder: Path, problem: Callable[[str], object]) -> Iterator[Results]:
