@@ -147,10 +147,11 @@ def _only(
 
 def _is_absolute(sheet: Sheet, column: int) -> bool:
     """Return whether a column has dates, or numbers as large as those since 1970."""
-    first = next((text for text in sheet.texts(column) if text), "")
-    if _DAY.search(first):
-        return True
-    return is_number(first) and abs(float(sheet.values(column)[0])) > _FEWEST_S
+    for row, line in enumerate(sheet.lines):
+        if text := line.split(sheet.separator)[column].strip():
+            is_large = is_number(text) and abs(sheet.value(row, column)) > _FEWEST_S
+            return is_large or _DAY.search(text) is not None
+    return False
 
 
 def _counter(sheet: Sheet, found: dict[str, ColumnChoice]) -> dict[str, ColumnChoice]:

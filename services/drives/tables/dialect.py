@@ -109,7 +109,7 @@ class Sheet(NamedTuple):
                 lines, delimiter=self.separator, comments=None, usecols=[column], ndmin=1
             )
         except ValueError:
-            found = np.array([self._value(row, column) for row in range(len(lines))])
+            found = np.array([self.value(row, column) for row in range(len(lines))])
         if np.isinf(found).any():
             row = int(np.argmax(np.isinf(found)))
             raise InputError(
@@ -135,10 +135,11 @@ class Sheet(NamedTuple):
             read = [cell.replace(",", ".") for cell in self.texts(column)]
             plain = self._replace(lines=read, separator="\x1e", dialect=self.dialect._replace(
                 decimal="."), header=(self.column_name(column),))  # fmt: skip
-            return np.array([plain._value(row, 0) for row in range(len(read))])
-        return np.array([self._value(row, column) for row in range(len(self.lines))])
+            return np.array([plain.value(row, 0) for row in range(len(read))])
+        return np.array([self.value(row, column) for row in range(len(self.lines))])
 
-    def _value(self, row: int, column: int) -> float:
+    def value(self, row: int, column: int) -> float:
+        """Return the number in a cell, row and column counted from 0; NaN if it is empty."""
         cell = self.lines[row].split(self.separator)[column].strip()
         if cell.lower() in _ABSENT:
             return np.nan
