@@ -32,7 +32,7 @@ _USUAL_WANDER_M, _USUAL_SPREAD = 0.12, 0.7
 is asked to keep to one path."""
 _LEVEL_SPREAD = 0.15
 """Relative standard deviation of the estimated level of the mismatch."""
-_WANDERS_M = np.geomspace(0.01, 1.0, 25)
+WANDERS_M = np.geomspace(0.01, 1.0, 25)
 _FINE = 481
 
 
@@ -44,15 +44,10 @@ class SharedFraction(NamedTuple):
 
 
 class WanderPosterior(NamedTuple):
-    """Estimate of the wander, and weights (g,) of the values in `wander_grid_m`."""
+    """Estimate of the wander, and weights (g,) of the values in `WANDERS_M`."""
 
     wander_m: float
     weights: FloatArray
-
-
-def wander_grid_m() -> FloatArray:
-    """Return the values (g,) of the wander in m whose spectra are averaged."""
-    return _WANDERS_M.copy()
 
 
 def align_runs_m(
@@ -212,7 +207,7 @@ def wander_posterior(mismatch: Mismatch, share: SharedFraction | None) -> Wander
         float(mismatch.level_m3 @ spectra @ weight) / whole
         for spectra in between_runs(*mismatch.shapes.footprints)
     ]
-    at = np.log(_WANDERS_M)
+    at = np.log(WANDERS_M)
     fine = np.linspace(at[0], at[-1], _FINE)
     score = -0.5 * ((fine - np.log(_USUAL_WANDER_M)) / _USUAL_SPREAD) ** 2
     if share is not None:
@@ -225,5 +220,5 @@ def wander_posterior(mismatch: Mismatch, share: SharedFraction | None) -> Wander
 
 @lru_cache(maxsize=8)
 def between_runs(front: Footprint, rear: Footprint) -> FloatArray:
-    """Return `between_run_spectra` (g, s, f) of all values in `wander_grid_m`."""
-    return np.stack([between_run_spectra(front, rear, float(w)) for w in _WANDERS_M])
+    """Return `between_run_spectra` (g, s, f) of all values in `WANDERS_M`."""
+    return np.stack([between_run_spectra(front, rear, float(w)) for w in WANDERS_M])

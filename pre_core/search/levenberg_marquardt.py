@@ -71,8 +71,6 @@ class LMInfo(NamedTuple):
     """Statistics of one step."""
 
     objective: float
-    step_size: float  # largest change of a logarithm
-    damping: float
     accepted: bool
     evaluations: int
     ending: Termination | None
@@ -106,7 +104,7 @@ def trial_step(
 ) -> TrialStep | tuple[LMState, LMInfo]:
     """Return a step to a smaller objective, or the final state; `lower` (f,) as in `descend`."""
     if not (np.isfinite(state.objective) and np.all(np.isfinite(state.jacobian))):
-        return state, LMInfo(state.objective, 0.0, state.damping, False, 0, Termination.NOT_FINITE)
+        return state, LMInfo(state.objective, False, 0, Termination.NOT_FINITE)
     f = state.y.size
     free = np.full(f, True)
     if lower is not None:
@@ -122,7 +120,7 @@ def trial_step(
     triangle, projected = _triangle(rows_of)
     # If even the full linear step predicts next to no improvement, the search has converged.
     if _square(projected) <= state.differences.converged_improvement * state.objective:
-        return state, LMInfo(state.objective, 0.0, state.damping, False, 0, Termination.CONVERGED)
+        return state, LMInfo(state.objective, False, 0, Termination.CONVERGED)
     damping = state.damping
     evaluations = 0
     while damping < _GIVE_UP_DAMPING:
@@ -143,11 +141,10 @@ def trial_step(
             eased = max(damping * 0.1, _SMALLEST_DAMPING)
             return TrialStep(trial, residual, objective, eased, size, evaluations)
         if size < _CONVERGED_STEP:
-            return state, LMInfo(
-                state.objective, size, damping, False, evaluations, Termination.CONVERGED
-            )
+            ending = Termination.CONVERGED
+            return state, LMInfo(state.objective, False, evaluations, ending)
         damping *= 10.0
-    return state, LMInfo(state.objective, 0.0, damping, False, evaluations, Termination.STUCK)
+    return state, LMInfo(state.objective, False, evaluations, Termination.STUCK)
 
 
 def descend(rows: Rows, state: LMState, lower: FloatArray | None = None) -> tuple[LMState, LMInfo]:
@@ -163,7 +160,7 @@ def descend(rows: Rows, state: LMState, lower: FloatArray | None = None) -> tupl
     ending = Termination.CONVERGED if there.size < _CONVERGED_STEP else None
     return (
         LMState(there.y, there.residual, slopes, there.objective, there.damping, state.differences),
-        LMInfo(there.objective, there.size, there.damping, True, evaluations, ending),
+        LMInfo(there.objective, True, evaluations, ending),
     )
 
 
@@ -192,7 +189,7 @@ def _follow(rows: Rows, state: LMState, lower: FloatArray | None) -> tuple[LMSta
         damping=there.damping,
         is_fresh=False,
     )
-    info = LMInfo(there.objective, there.size, there.damping, True, there.evaluations, ending)
+    info = LMInfo(there.objective, True, there.evaluations, ending)
     if ending is None and state.objective - there.objective < _KEPT * promised:
         return _refresh_jacobian(rows, following, info)
     return following, info

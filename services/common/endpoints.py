@@ -11,3 +11,15 @@ DEFAULT_TLS_ENDPOINT: Final = "tls/127.0.0.1:7447"
 def default_endpoint(tls: Path | None) -> str:
     """Return the default endpoint of a logger and its clients, with or without credentials."""
     return DEFAULT_ENDPOINT if tls is None else DEFAULT_TLS_ENDPOINT
+
+
+class OnTheBus:
+    """Options of a command that connects to a logger."""
+
+    endpoint: str | None
+    tls: Path | None
+
+    @property
+    def address(self) -> str:
+        """Address of the bus."""
+        return self.endpoint or default_endpoint(self.tls)

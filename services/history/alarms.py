@@ -74,8 +74,6 @@ class AlarmSettings(NamedTuple):
 class MonitoredBridge(NamedTuple):
     """Result of monitoring one bridge; times in s since 1970 UTC."""
 
-    begins_s: tuple[float, ...]
-    """Beginnings of the periods."""
     result: MonitoringResult | None
     """Result of the detection; None without usable crossings."""
     alarm: Alarm | None
@@ -128,7 +126,7 @@ def monitor_bridge(
     begins, periods = _periods(read.crossings, settings.unit, now_s, problems)
     record = _record(read.crossings, begins, settings, now_s)
     if not periods:
-        return MonitoredBridge((), None, None, record, tuple(problems))
+        return MonitoredBridge(None, None, record, tuple(problems))
     notes = [
         AcknowledgedChange(
             since=sum(begin < alarm.since for begin in begins),
@@ -143,7 +141,7 @@ def monitor_bridge(
         problem = f"cannot be watched: {error}"
         problems.append(f"{partition(folder, realm, bridge)}: {problem}")
         record = record.model_copy(update={"problem": problem})
-        return MonitoredBridge(tuple(begins), None, None, record, tuple(problems))
+        return MonitoredBridge(None, None, record, tuple(problems))
     record = _judged(record, periods, begins, result, settings)
     alarm = None
     if result.change is not None:
@@ -164,7 +162,7 @@ def monitor_bridge(
             ratio_q025=float(of.low[of.element]),
             ratio_q975=float(of.high[of.element]),
         )
-    return MonitoredBridge(tuple(begins), result, alarm, record, tuple(problems))
+    return MonitoredBridge(result, alarm, record, tuple(problems))
 
 
 def check(

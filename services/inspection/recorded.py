@@ -46,8 +46,6 @@ class InspectedRun(NamedTuple):
     samples: Samples | None
     rates_hz: dict[str, float]
     """Rate of each channel, measured by the truck's clock."""
-    declared_rates_hz: dict[str, float]
-    """Rate of each channel, as the messages declare it."""
     missing_batches: int
     clocks: dict[str, ClockSeries]
     """Clocks of "accel" and "gnss"."""
@@ -102,7 +100,6 @@ def _recorded(source: str, drive: DriveMessages) -> InspectedRun:
         np.array([np.nan if value is None else value for value in accuracy]),
         _samples(boot, inspected),
         _rates(inspected),
-        {name: c.rate_hz for batch in inspected[:1] for name, c in batch.channels.items()},
         sum(after - before - 1 for before, after in pairwise(sorted(drive.accelerations))),
         {
             "accel": _clock(batches, zero_ns),

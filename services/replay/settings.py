@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from services.common.endpoints import default_endpoint
+from services.common.endpoints import OnTheBus
 from services.common.options import (
     endpoint_option,
     flag,
@@ -20,7 +20,7 @@ _PATTERNS = "patterns with * and ?, separated by commas, of STREAM or OWNER/ID/S
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplaySettings:
+class ReplaySettings(OnTheBus):
     """Options of `driveby replay`: a drive, its published part, and the pace."""
 
     recordings: tuple[Path, ...] = positional(
@@ -87,11 +87,6 @@ class ReplaySettings:
         action="append",
         metavar="OLD=NEW",
     )
-
-    @property
-    def address(self) -> str:
-        """Address of the bus."""
-        return self.endpoint or default_endpoint(self.tls)
 
     @property
     def realm_name(self) -> str:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from services.common.endpoints import default_endpoint
+from services.common.endpoints import OnTheBus
 from services.common.options import (
     endpoint_option,
     flag,
@@ -33,7 +33,7 @@ def _spool_budget_option() -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TruckSettings:
+class TruckSettings(OnTheBus):
     """Options of `driveby truck`: a recording, and the bus on which it is published."""
 
     recording: Path = positional(
@@ -55,14 +55,9 @@ class TruckSettings:
         "identifier of the vehicle to publish, where there are several", metavar="ID"
     )
 
-    @property
-    def address(self) -> str:
-        """Address of the bus."""
-        return self.endpoint or default_endpoint(self.tls)
-
 
 @dataclass(frozen=True, kw_only=True)
-class GatewaySettings:
+class GatewaySettings(OnTheBus):
     """Options of `driveby gateway`: a ROS 2 router, its truck, and the bus for its data."""
 
     what: str = positional("ros2: with rmw_zenoh, see docs/truck.md", choices=("ros2",))
@@ -78,8 +73,3 @@ class GatewaySettings:
     endpoint: str | None = endpoint_option()
     tls: Path | None = tls_option()
     realm: str = realm_option()
-
-    @property
-    def address(self) -> str:
-        """Address of the bus."""
-        return self.endpoint or default_endpoint(self.tls)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from services.common.endpoints import LOOPBACK, default_endpoint
+from services.common.endpoints import LOOPBACK, OnTheBus
 from services.common.options import (
     endpoint_option,
     flag,
@@ -22,7 +22,7 @@ _LIVE: Final = "live"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewSettings:
+class ViewSettings(OnTheBus):
     """Options of `driveby view`: a file or the bus, and the address for viewers."""
 
     target: str = positional(
@@ -51,11 +51,6 @@ class ViewSettings:
         default=0,
         group=_LIVE,
     )
-
-    @property
-    def address(self) -> str:
-        """Address of the bus."""
-        return self.endpoint or default_endpoint(self.tls)
 
     @property
     def show(self) -> Show | None:

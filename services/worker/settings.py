@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from services.common.endpoints import default_endpoint
+from services.common.endpoints import OnTheBus
 from services.common.options import (
     config_option,
     endpoint_option,
@@ -26,7 +26,7 @@ _VALIDATION = "validation"
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorkerSettings:
+class WorkerSettings(OnTheBus):
     """Settings of one run of the worker."""
 
     config: Path | None = config_option()
@@ -76,11 +76,6 @@ class WorkerSettings:
         default=2.0,
         metavar="DAYS",
     )
-
-    @property
-    def address(self) -> str:
-        """Address of the bus."""
-        return self.endpoint or default_endpoint(self.tls)
 
     @property
     def search_method(self) -> str:

@@ -15,10 +15,10 @@ from pre_core.crossing.posterior import layout, log_odds_of_absence
 from pre_core.fusion.information import BridgePriors
 from pre_core.fusion.joint import FusedDraws, build_joint, sample_joint
 from pre_core.fusion.lateral_wander import (
+    WANDERS_M,
     SharedFraction,
     align_runs_m,
     shared_fraction,
-    wander_grid_m,
     wander_posterior,
 )
 from pre_core.fusion.likelihood import (
@@ -119,7 +119,7 @@ def test_wander_without_a_share_is_that_of_the_prior() -> None:
     found = wander_posterior(whole(), None)
     assert found.wander_m == pytest.approx(0.12, rel=0.02)
     assert found.weights.sum() == pytest.approx(1.0)
-    spread = np.sqrt(found.weights @ np.log(wander_grid_m() / found.wander_m) ** 2)
+    spread = np.sqrt(found.weights @ np.log(WANDERS_M / found.wander_m) ** 2)
     assert spread == pytest.approx(0.7, abs=0.05)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from services.cli.alarm_line import alarm_line
 from services.cli.parser import Subcommand
-from services.common.endpoints import default_endpoint
+from services.common.endpoints import OnTheBus
 from services.common.errors import InputError
 from services.common.naming import count_of
 from services.common.options import (
@@ -36,7 +36,7 @@ _HOW = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class AlarmOptions:
+class AlarmOptions(OnTheBus):
     """Options of `driveby alarm`: the action, and how changes are detected."""
 
     what: str = positional(
@@ -201,9 +201,8 @@ def _realm_of(folder: Path, bridge: str, realm: str | None) -> str:
 def _serve(options: AlarmOptions) -> int:
     from services.cli.alarm_service import serve
 
-    endpoint = options.endpoint or default_endpoint(options.tls)
     every_s = 60.0 * options.every
-    return serve(options.history, lambda: _checked(options), endpoint, options.tls, every_s)
+    return serve(options.history, lambda: _checked(options), options.address, options.tls, every_s)
 
 
 COMMAND: Final = Subcommand(

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from services.cli.parser import Announce, ServiceCommand
-from services.common.endpoints import default_endpoint
+from services.common.endpoints import OnTheBus
 from services.common.errors import InputError
 from services.common.options import (
     endpoint_option,
@@ -25,7 +25,7 @@ def _address(text: str) -> tuple[str, int]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HealthOptions:
+class HealthOptions(OnTheBus):
     """Services whose health is queried, and the form of the answer."""
 
     service: str | None = positional(
@@ -52,7 +52,7 @@ class HealthOptions:
 def _health(options: HealthOptions, announce: Announce) -> int:
     asked: dict[str, Any] = {
         "service": options.service,
-        "endpoint": options.endpoint or default_endpoint(options.tls),
+        "endpoint": options.address,
         "tls": options.tls,
         "realm": options.realm,
     }

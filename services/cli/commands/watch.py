@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from services.cli.parser import Subcommand
 from services.cli.parsing import a_console
-from services.common.endpoints import default_endpoint
+from services.common.endpoints import OnTheBus
 from services.common.options import endpoint_option, realm_option, tls_option
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ _HINT_AFTER_S: Final = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class WatchOptions:
+class WatchOptions(OnTheBus):
     """A realm to show."""
 
     endpoint: str | None = endpoint_option()
@@ -41,7 +41,7 @@ def _watch(asked: WatchOptions) -> int:
     from services.bus.playback import leave_at_once, stopped_by_signals
     from services.bus.realm_listener import open_listener
 
-    endpoint, console = asked.endpoint or default_endpoint(asked.tls), a_console()
+    endpoint, console = asked.address, a_console()
     with (
         stopped_by_signals(leave_at_once) as stop,
         open_listener(endpoint, asked.tls, asked.realm, stop.is_set) as heard,

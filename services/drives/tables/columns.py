@@ -43,33 +43,10 @@ _REAR: Final = {"rear", "back", "hinten", "hinter", "ha", "r", "h", "re", "rl", 
                 }  # fmt: skip
 _VERTICAL: Final = {"z", "az", "vertical", "vertikal", "vert", "verticale", "up", "senkrecht"}
 _LEVEL: Final = {"x", "y", "ax", "ay", "lateral", "longitudinal", "quer", "längs", "laengs"}
-_FILLERS: Final = frozenset(
-    [
-        "gps",
-        "gnss",
-        "acc",
-        "accel",
-        "acceleration",
-        "beschleunigung",
-        "deg",
-        "m",
-        "s",
-        "z",
-        "az",
-        "value",
-        "wgs84",
-        "ms",
-        "utc",
-        "unix",
-        "of",
-        "the",
-        "in",
-        "seconds",
-    ]
-)
-
-
-_JOINS: Final = frozenset(["und", "and", "et", "y", "e", "en"])
+_FILLERS: Final = {"gps", "gnss", "acc", "accel", "acceleration", "beschleunigung", "deg", "m", "s",
+                   "z", "az", "value", "wgs84", "ms", "utc", "unix", "of", "the", "in", "seconds",
+                   }  # fmt: skip
+_JOINS: Final = {"und", "and", "et", "y", "e", "en"}
 _DAY: Final = re.compile(r"\d{1,4}[-./]\w{1,9}[-./]\d{1,4}")
 _FEWEST_S: Final = 9e8
 """Smallest number of seconds since 1970 of a drive; numbers from a start are smaller."""
