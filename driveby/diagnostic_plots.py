@@ -7,15 +7,13 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.notebook.arguments import names_of
 from services.notebook.inference import prior_draws
 from services.notebook.solution import Identification, Solution, one_solution
 from services.viewer.drawing import MUTED, STYLE, mark_bridge, simplify_axes
-
-Floats = NDArray[np.float64]
 
 _BRIDGE: Final = "#e3ebf0"
 _COLUMNS: Final = 4

@@ -17,16 +17,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.fusion.joint import mass_sensitivity
 from schemas.fusion import FusionLikelihood
 from schemas.results import CrossingResult, Parameter, ResultHeader, Results, load_results, results
+from services.common.arrays import Floats
 from services.identification.fusing import part_of
 from services.identification.observed import observation_of
 from services.identification.usable import Source
 
-Floats = NDArray[np.float64]
 STORED = Path(__file__).parent / "data" / "fleet_likelihoods.json"
 DAY_S = 86_400.0
 WEEK_S = 7.0 * DAY_S

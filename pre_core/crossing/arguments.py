@@ -5,14 +5,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.rows import RESIDUALS, RowFilter, row_count
 from pre_core.kernels.lanes import LANES
 from pre_core.physics import modal_response
 from pre_core.physics.beam_basis import BeamBasis
 from pre_core.physics.tandem import NO_LEAD, Lead
 from pre_core.physics.torsion import GROUPS, NO_TORSION, TorsionBasis
-
-FloatArray = NDArray[np.float64]
 
 LONGEST_STRETCH = 128
 """Steps marched at a time, so that their work arrays stay in the cache."""

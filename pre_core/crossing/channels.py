@@ -11,8 +11,8 @@ interpolation, by Taylor's series.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.splines import (
     Spline,
     antiderivative,
@@ -21,8 +21,6 @@ from pre_core.crossing.splines import (
     interpolating_spline,
 )
 from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
-
-FloatArray = NDArray[np.float64]
 
 Z, V, A, A_1, A_2, A_3 = range(6)
 """Indices of displacement, velocity, acceleration and its three derivatives."""

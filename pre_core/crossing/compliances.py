@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.posterior import (
     PosteriorProblem,
@@ -29,8 +30,6 @@ from pre_core.crossing.posterior import (
 )
 from pre_core.crossing.preparation import mismatch_gradient
 from pre_core.kernels.lanes import kernel
-
-FloatArray = NDArray[np.float64]
 
 _SETTLING = 500
 _SWEEPS = 60

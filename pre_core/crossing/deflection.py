@@ -6,6 +6,7 @@ The wheels' loads drive the bridge's modes from sample to sample; the quasi-stat
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import tandem
 from pre_core.crossing.arguments import LONGEST_STRETCH, Buffers, EvaluationPoints, GriddedCrossing
 from pre_core.crossing.step_tables import PHASES as _PHASES
@@ -15,8 +16,6 @@ from pre_core.parameters import EI_1, FIRST_OF_BRIDGE, RHO_A, TORSION
 from pre_core.physics import modal_response
 from pre_core.physics.beam_basis import ModalFilters
 from pre_core.physics.torsion import flexibility_remainder, torsion_filters
-
-FloatArray = NDArray[np.float64]
 
 SWING_MODES = 3
 """Number of modes with initial vibration; a load excites the j-th by 1/j^2 of the first."""

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.noise import FRICTION_STATISTIC_OF_MISFIT, no_suspension_noise
 from pre_core.crossing.posterior import (
     PosteriorProblem,
@@ -28,7 +29,6 @@ from pre_core.crossing.preparation import (
 )
 from pre_core.crossing.rows import RESIDUALS
 from pre_core.parameters import TORSION, F
-from pre_core.physics.bridge import FloatArray
 from pre_core.search import levenberg_marquardt
 from pre_core.search.levenberg_marquardt import Rows, minimise
 from pre_core.search.loop import SearchResult, Termination

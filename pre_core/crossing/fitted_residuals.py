@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.fit import chi2_per_dof
 from pre_core.crossing.noise import FRICTION_STATISTIC_OF_MISFIT, no_suspension_noise
 from pre_core.crossing.off_bridge import levels_at, rear_axle_chainage_m
@@ -22,7 +23,6 @@ from pre_core.crossing.preparation import (
     with_lines_of,
 )
 from pre_core.crossing.rows import RESIDUALS
-from pre_core.physics.bridge import FloatArray
 from pre_core.search.levenberg_marquardt import minimise
 
 BEFORE, ON, AFTER = range(3)

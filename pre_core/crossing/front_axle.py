@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky, toeplitz
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.channels import A
 from pre_core.crossing.mismatch import density_at, hann_taper, pavement_ratio
 from pre_core.crossing.off_bridge import surface_level_at
@@ -34,8 +35,6 @@ from pre_core.crossing.residuals import roads_and_deflections
 from pre_core.crossing.tandem import lead_motion
 from pre_core.crossing.whitening import Whitener, project_out_noise, solve
 from pre_core.physics.tandem import lead_response, shared_load
-
-FloatArray = NDArray[np.float64]
 
 RUNS: Final = 12.0
 """Number of runs over one profile for which fusion is exact; it is conservative with fewer."""

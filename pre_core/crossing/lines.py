@@ -16,11 +16,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import splines
-
-FloatArray = NDArray[np.float64]
 
 _KNOT_S = 1.0
 """Knot spacing of the waves' amplitudes and phases."""

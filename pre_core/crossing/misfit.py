@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.fit import Optimum, chi2_stride, evaluations_of
 from pre_core.crossing.off_bridge import levels_at, off_bridge_residuals
 from pre_core.crossing.posterior import PosteriorProblem, all_rows, layout
 from pre_core.crossing.rows import RESIDUALS
-from pre_core.physics.bridge import FloatArray
 from pre_core.search.levenberg_marquardt import minimise
 
 EXPLAINED_CHI2 = 1.5

@@ -20,13 +20,11 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.whittle import maximum_likelihood_levels
 from pre_core.physics.road import REFERENCE_CYCLES_PER_M
 from pre_core.physics.surface import Footprint, between_run_cross_spectrum, spectra, surface_density
-
-FloatArray = NDArray[np.float64]
 
 CORRELATION_LENGTH_M = 5.0
 _OFFSET_M = 0.005

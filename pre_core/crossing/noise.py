@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import mismatch as _mismatch
 from pre_core.crossing.channels import GainsAndDelays
 from pre_core.crossing.mismatch import Mismatch
@@ -44,8 +45,6 @@ from pre_core.parameters import C_S1, C_U1, D_1, K_S1, K_U1, KAPPA, M_U1, SHARE
 from pre_core.physics import tandem
 from pre_core.physics.tandem import NO_LEAD, Lead
 from pre_core.physics.vehicle import masses_above_axles
-
-FloatArray = NDArray[np.float64]
 
 _SOURCES = 6  # s1, s2, u1, u2; and the other body sensor at the front's and at the rear's moment
 _FEW_FREQUENCIES = 48

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.mismatch import has_equal_tyres
 from pre_core.crossing.noise import mismatch_levels
 from pre_core.crossing.posterior import (
@@ -13,7 +14,6 @@ from pre_core.crossing.posterior import (
     points,
 )
 from pre_core.crossing.rows import row_count
-from pre_core.physics.bridge import FloatArray
 from pre_core.physics.simulate import rear_position_m
 
 FEWEST_ROWS = 24

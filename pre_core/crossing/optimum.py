@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.comparison import is_better
 from pre_core.crossing.deflection import SWING_MODES
 from pre_core.crossing.fit import (
@@ -54,7 +55,6 @@ from pre_core.crossing.preparation import (
 )
 from pre_core.crossing.rows import RESIDUALS
 from pre_core.crossing.walk import Placement, better_neighbour, scan_offsets, shifted_to
-from pre_core.physics.bridge import FloatArray
 from pre_core.search import levenberg_marquardt
 from pre_core.search.loop import Report, Termination
 

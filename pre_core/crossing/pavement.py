@@ -16,6 +16,7 @@ an end exceed the noise, all local waves there are removed from the whitened res
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import mismatch as _mismatch
 from pre_core.crossing.front_axle import FrontAxleResponse, front_axle_power
 from pre_core.crossing.mismatch import BridgePavement, Mismatch, PeriodogramSegment
@@ -24,7 +25,6 @@ from pre_core.crossing.off_bridge import FEWEST_ROWS, rear_axle_chainage_m, rear
 from pre_core.crossing.posterior import PosteriorProblem, filtered_rows, noise_path_at
 from pre_core.crossing.rows import RESIDUALS, filter_rows, phases
 from pre_core.crossing.whitening import Whitener, solve
-from pre_core.physics.bridge import FloatArray
 
 RATIO_SPREAD, TILT_SPREAD = 0.7, 0.12
 """Standard deviations of r and t. A measured deck was 2.5 to 3.8 times as

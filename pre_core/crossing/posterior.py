@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import noise as _noise
 from pre_core.crossing import splines
 from pre_core.crossing.arguments import Buffers, EvaluationPoints, GriddedCrossing
@@ -32,8 +33,6 @@ from pre_core.crossing.rows import RESIDUALS, RowFilter, filter_rows, row_count
 from pre_core.crossing.whitening import Whitener
 from pre_core.parameters import EI_1, K_U1, M_U1
 from pre_core.physics.tandem import Lead
-
-FloatArray = NDArray[np.float64]
 
 # Three directions in which four gains differ; the common gain is separate.
 _CONTRASTS = np.array(

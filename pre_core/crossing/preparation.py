@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pre_core.arrays import FloatArray
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import lines
 from pre_core.crossing.arguments import EvaluationPoints, GriddedCrossing, allocate_buffers
@@ -46,7 +47,6 @@ from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_FACTOR
 from pre_core.crossing.whitening import Whitener, solve, whitener
 from pre_core.parameters import FIRST_OF_BRIDGE, TORSION
 from pre_core.physics.beam_basis import beam_basis, change_basis
-from pre_core.physics.bridge import FloatArray
 from pre_core.physics.surface import TYPICAL_FOOTPRINTS, Footprint
 from pre_core.physics.tandem import NO_LEAD, Lead
 from pre_core.physics.torsion import NO_TORSION, TorsionBasis, torsion_basis

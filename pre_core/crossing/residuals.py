@@ -14,6 +14,7 @@ from threading import Thread
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import tandem
 from pre_core.crossing.arguments import Buffers, EvaluationPoints, GriddedCrossing
 from pre_core.crossing.channels import A_1, A_2, A_3, A, V, Z
@@ -26,8 +27,6 @@ from pre_core.crossing.whitening import Whitener, project_out_noise, whiten_into
 from pre_core.kernels.lanes import kernel, summing
 from pre_core.parameters import C_S1, C_U1, D_1, K_S1, K_U1, KAPPA, M_U1
 from pre_core.physics.vehicle import masses_above_axles, masses_on_axles
-
-FloatArray = NDArray[np.float64]
 
 _FEW = 4  # points that are not worth starting a thread
 _WHITE, _PLAIN, _DEFLECTIONS = range(3)

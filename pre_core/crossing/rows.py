@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.channels import low_pass
 from pre_core.kernels.lanes import summing
-
-FloatArray = NDArray[np.float64]
 
 RESIDUALS = 3
 SAMPLES_PER_RESIDUAL = 3

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import compliances, posterior, surrogate
 from pre_core.crossing.fit import Optimum, normal_approximation
 from pre_core.parameters import RHO_A, TORSION
@@ -18,7 +19,6 @@ from pre_core.physics.torsion import NO_TORSION
 from pre_core.search import convergence, importance, levenberg_marquardt
 from pre_core.search.loop import Report, Termination
 
-FloatArray = NDArray[np.float64]
 LogDensity = Callable[[FloatArray], FloatArray]
 """Logarithm of the posterior (k,) at points (k, f), up to a constant."""
 

@@ -7,12 +7,10 @@ each axle.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.posterior import PosteriorProblem, filtered_rows, points
 from pre_core.physics.simulate import rear_position_m
-
-FloatArray = NDArray[np.float64]
 
 _BAND_HZ = (3.0, 12.0)
 """Band: below it, errors of the truck's parameters move both ends equally; above it there is noise.

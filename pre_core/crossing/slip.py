@@ -17,15 +17,13 @@ a standard normal without a change, for every channel and every t_0.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.channels import A_1, A_2, A_3, A, V, Z
 from pre_core.crossing.layout import CHANNELS
 from pre_core.crossing.posterior import PosteriorProblem, points
 from pre_core.crossing.residuals import evaluate_white
 from pre_core.search.levenberg_marquardt import LMState
-
-FloatArray = NDArray[np.float64]
 
 DELAY, GAIN = range(2)
 _MOMENTS = ((24, 0.0), (10, 0.15))

@@ -1,11 +1,9 @@
 """Deviation of a receiver's speeds from those of a fit."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.posterior import PosteriorProblem, layout
-
-FloatArray = NDArray[np.float64]
 
 
 def speed_bias(problem: PosteriorProblem, y: FloatArray) -> float:

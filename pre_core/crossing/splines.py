@@ -8,11 +8,9 @@ of de Boor (1972) and Cox (1972); the first and the last polynomial extend beyon
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from pre_core.arrays import FloatArray, IntArray
 
 
 class Spline(NamedTuple):

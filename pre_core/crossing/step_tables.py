@@ -1,12 +1,10 @@
 """Tables to interpolate signals between samples, and the force step of a wheel on a bearing."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.channels import PASS_BAND, STOP
 from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
-
-FloatArray = NDArray[np.float64]
 
 PHASES = 64
 """Number of phases between two samples in the table of a wheel's step on entry or exit."""

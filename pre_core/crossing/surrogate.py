@@ -19,13 +19,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import compliances
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.posterior import layout, log_odds_of_absence
 from pre_core.parameters import ALPHA, BETA, RHO_A
 from pre_core.search.convergence import CHAINS
-
-FloatArray = NDArray[np.float64]
 
 _LOWEST = 8.0
 """Largest drop of a log weight, below the median of the latest draws, that the regression sees: far

@@ -1,9 +1,8 @@
 """Spectra of suspension noise, by friction and nonlinear dampers, from basis functions."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pre_core.arrays import FloatArray
 
 REDUCED_WEIGHT_SPRING_N_PER_M = 4e5
 """Divisor of body equations with reduced weight. Divided by the estimated stiffness, the suspension

@@ -9,13 +9,12 @@ corrected as the estimate of truck and bridge improves.
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.arguments import Buffers, GriddedCrossing
 from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_SPRING_N_PER_M
 from pre_core.kernels.lanes import Lanes, fma, fma_scalar, kernel, load, mul, store
 from pre_core.parameters import C_S1, C_U1, K_S1, K_U1, M_U1, SHARE
 from pre_core.physics.tandem import Lead, lead_response, own_springs, shared_load
-
-FloatArray = NDArray[np.float64]
 
 _LEAD_BAND_HZ = (0.2, 0.4)
 """Band from which on the front axle's motion is computed; below it the axle follows the road, whose

@@ -1,8 +1,8 @@
 """Friction of a tandem without load equalisation, relative to its load."""
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.posterior import PosteriorProblem, has_tandem, points
 from pre_core.crossing.suspension_noise import force_rms_n
-from pre_core.physics.bridge import FloatArray
 from pre_core.physics.tandem import shared_load
 
 

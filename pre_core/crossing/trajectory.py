@@ -10,13 +10,11 @@ so that constant speed and constant acceleration cost nothing (P-splines; Eilers
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lstsq
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.splines import Spline, basis, clamped_knots, value_at
 from pre_core.physics.simulate import Motion
-
-FloatArray = NDArray[np.float64]
 
 _KNOT_SPACING_S = 0.5
 _JERK_M_PER_S3 = 0.3

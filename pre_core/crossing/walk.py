@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.fit import (
     Optimum,
     SearchStrategy,
@@ -23,7 +24,6 @@ from pre_core.crossing.posterior import (
     has_tandem,
     layout,
 )
-from pre_core.physics.bridge import FloatArray
 from pre_core.search import levenberg_marquardt
 from pre_core.search.levenberg_marquardt import minimise
 

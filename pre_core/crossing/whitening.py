@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import mismatch as _mismatch
 from pre_core.crossing.lines import project_out
 from pre_core.crossing.mismatch import Mismatch
@@ -17,8 +18,6 @@ from pre_core.crossing.noise import NoisePath, noise_spectrum
 from pre_core.crossing.rows import RESIDUALS, RowFilter, filter_rows, phases
 from pre_core.crossing.suspension_noise import FORCE_MEMORY_S
 from pre_core.kernels.lanes import summing
-
-FloatArray = NDArray[np.float64]
 
 _SETTLED = 1e-12
 """Relative change below which rows of the factor repeat to rounding."""

@@ -1,9 +1,8 @@
 """Levels of sources with known spectra, from a periodogram (Whittle 1953)."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pre_core.arrays import FloatArray
 
 _PASSES = 200
 

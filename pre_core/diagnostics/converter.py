@@ -1,9 +1,8 @@
 """Quantisation step of the analogue-to-digital converter that recorded a signal."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pre_core.arrays import FloatArray
 
 _OFF_GRID = 0.01
 """Tolerance of a grid, relative to its step."""

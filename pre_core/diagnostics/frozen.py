@@ -9,7 +9,7 @@ steps, which does not happen to a signal that merely stays within one step.
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pre_core.arrays import FloatArray
 
 _SHORTEST_S, _LONG_S = 0.01, 0.04
 """Shortest stretch that counts, and shortest held one that counts whatever the share of equal

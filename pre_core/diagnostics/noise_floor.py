@@ -8,11 +8,9 @@ needs at least 400 Hz.
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.constants import MICRO_G_M_PER_S2
-
-Floats = NDArray[np.float64]
 
 _PIECE_S: Final = 1.0
 _FEWEST_PIECES: Final = 5
@@ -29,7 +27,7 @@ _WHEELS_HZ: Final = 120.0
 class NoiseSegment(NamedTuple):
     """A stretch of samples (n,) of one channel without gaps, and whether the truck stood still."""
 
-    values: Floats
+    values: FloatArray
     rate_hz: float
     is_standing: bool
 

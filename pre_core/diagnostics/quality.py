@@ -12,9 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.diagnostics.converter import converter_step
-
-FloatArray = NDArray[np.float64]
 
 _BODY_BAND_HZ = (0.7, 10.0)
 """Band in which bodies vibrate on their springs; wheels hop above it."""

@@ -1,9 +1,8 @@
 """Consistency of a GNSS receiver's speeds with its positions."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pre_core.arrays import FloatArray
 
 _FEWEST = 4
 _DRIFT_S = 300.0

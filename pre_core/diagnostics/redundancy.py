@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pre_core.arrays import FloatArray
 
 _BAND_HZ = (0.7, 12.0)
 """Band in which the motion of bodies and axles exceeds sensor noise."""

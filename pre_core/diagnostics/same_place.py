@@ -1,9 +1,8 @@
 """Correlation of motions at the same place of the road: which of two readings meets it first."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pre_core.arrays import FloatArray
 
 _BOUNCE_BAND_HZ = (0.3, 4.0)
 """Band of a body's motion on its springs."""

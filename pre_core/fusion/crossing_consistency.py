@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from pre_core.arrays import FloatArray
 from pre_core.fusion.information import (
     BridgePriors,
     CrossingInformation,
@@ -27,8 +28,6 @@ from pre_core.fusion.information import (
 from pre_core.fusion.joint import build_joint
 from pre_core.fusion.path_groups import FusionInput
 from pre_core.fusion.variability import variability_posterior
-
-FloatArray = NDArray[np.float64]
 
 _USUAL_CHANGE = 0.03
 _SUSPICIOUS, _INCOMPATIBLE = 1e-3, 1e-4

@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import posterior
 from pre_core.crossing.compliances import compliance_normal
 from pre_core.crossing.fit import Optimum
-
-FloatArray = NDArray[np.float64]
 
 _STEP = 0.7
 """Step of the second differences, relative to a standard deviation."""

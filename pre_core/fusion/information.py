@@ -6,10 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.fusion.likelihood import Coordinates
 from pre_core.fusion.path_groups import PathGroupKey, SharedMismatch
-
-FloatArray = NDArray[np.float64]
 
 _ROUGH_SPREAD = 0.6
 """Standard deviation of a normal prior of c that replaces the log-normal one in evidence ratios."""

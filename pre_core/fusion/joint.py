@@ -16,8 +16,8 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.compliances import CompliancePosterior, draws, from_normal, marginal
 from pre_core.fusion.information import (
     BridgePriors,
@@ -45,8 +45,6 @@ from pre_core.fusion.variability import (
 from pre_core.search.convergence import CHAINS
 from pre_core.search.levenberg_marquardt import minimise
 from pre_core.search.loop import Report
-
-FloatArray = NDArray[np.float64]
 
 _USUAL = (0.03, 0.3)
 """Values of tau and rho for the bridge about which likelihoods are linearised."""

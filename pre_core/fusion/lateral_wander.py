@@ -11,14 +11,12 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.mismatch import Mismatch, between_run_spectra
 from pre_core.fusion.likelihood import OFF_BRIDGE_STEP_M, OffBridgeMismatch
 from pre_core.physics.road import Profile
 from pre_core.physics.surface import Footprint
-
-FloatArray = NDArray[np.float64]
 
 _APART_STEPS = 4
 """Step of the second difference that determines the shared fraction: waves of one to four metres.

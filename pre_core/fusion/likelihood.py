@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, qr
 
 from pre_core import parameters
+from pre_core.arrays import FloatArray
 from pre_core.crossing import front_axle, posterior
 from pre_core.crossing.arguments import EvaluationPoints, GriddedCrossing
 from pre_core.crossing.compliances import (
@@ -44,8 +45,6 @@ from pre_core.fusion.curvature import linearise_with_curvature as straightened_a
 from pre_core.fusion.short_waves import BESIDE_M, ShortWaveResponse, short_wave_response
 from pre_core.physics.simulate import rear_position_m
 from pre_core.search import levenberg_marquardt
-
-FloatArray = NDArray[np.float64]
 
 KNOT_M, ALIKE_KNOT_M = 1.25, 0.5
 """Knot spacing of the long mismatch waves, cubic between; for different and for equal footprints.

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.mismatch import LONG_CYCLES_PER_M, Mismatch, mismatch_spectra
 from pre_core.fusion.lateral_wander import (
     align_runs_m,
@@ -26,8 +26,6 @@ from pre_core.fusion.likelihood import (
 from pre_core.fusion.short_waves import shared_error_roots
 from pre_core.physics.road import Profile
 from pre_core.physics.surface import Footprint
-
-FloatArray = NDArray[np.float64]
 
 _NOTHING = 1e-9
 """Relative variance below which a sum of waves is rounding."""

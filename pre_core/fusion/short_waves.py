@@ -14,15 +14,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import posterior
 from pre_core.crossing.compliances import compliance_normal
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.rows import RESIDUALS, filter_adjoint
 from pre_core.crossing.whitening import project_out_noise, solve_transposed
-
-FloatArray = NDArray[np.float64]
 
 BESIDE_M = 7.5
 """Distance before and after the bridge over which the mismatch is correlated with that on it."""

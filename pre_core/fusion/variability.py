@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.splines import curves_at, interpolating_spline
 from pre_core.fusion.information import (
     BridgePriors,
@@ -18,8 +19,6 @@ from pre_core.fusion.information import (
     add_bridge_priors,
     sum_information,
 )
-
-FloatArray = NDArray[np.float64]
 
 BETWEEN_SCALE = 0.04
 """Scale of the half-normal prior of tau: temperature changes a concrete bridge's EI by some per

@@ -12,9 +12,9 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.compliances import marginal
 from pre_core.fusion.information import (
     BridgePriors,
@@ -24,8 +24,6 @@ from pre_core.fusion.information import (
 )
 from pre_core.fusion.joint import single_crossing_joint
 from pre_core.fusion.path_groups import FusionInput
-
-FloatArray = NDArray[np.float64]
 
 _USUAL_CHANGE = 0.03
 """Change of a parameter from run to run, in standard deviations of its prior: fuel, warm dampers,

@@ -7,11 +7,9 @@ diagonal.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.kernels.lanes import LANES, Lanes, fma, kernel, load, mul, store
-
-FloatArray = NDArray[np.float64]
 
 MAX_SWEEPS = 30
 """Bound for matrices with values that are not finite; others need a few sweeps."""

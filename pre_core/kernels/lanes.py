@@ -7,16 +7,15 @@ loops over arrays. None of the functions allocates.
 
 from functools import partial
 
-import numpy as np
 from numba import config, njit
-from numpy.typing import NDArray
+
+from pre_core.arrays import FloatArray
 
 # LLVM packs the tuples into vector registers only with its superword pass, which numba leaves off.
 # It changes speed alone. The cache of compiled kernels does not know the flag, so every kernel is
 # compiled by `compiled` below, and none before this line.
 setattr(config, "SLP_VECTORIZE", 1)  # noqa: B010 - the type stubs do not know it
 
-FloatArray = NDArray[np.float64]
 Lanes = tuple[float, float, float, float]
 
 LANES = 4

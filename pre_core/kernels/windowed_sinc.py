@@ -6,9 +6,8 @@ band of -A dB.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pre_core.arrays import FloatArray
 
 
 def kaiser_beta(stop_band_db: float) -> float:

@@ -22,11 +22,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.constants import SLOPE_SPREAD
 from pre_core.fusion.variability import BETWEEN_SCALE
 from pre_core.monitoring.observation import Observation, SharedError
-
-FloatArray = NDArray[np.float64]
 
 REFERENCE_DEG_C = 10.0
 LEVEL_SPREAD = 1.0

@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.constants import NORMAL_975
 from pre_core.monitoring.baseline import (
     LEVEL_SPREAD,
@@ -36,8 +37,6 @@ from pre_core.monitoring.chart import (
     skip_period,
     update_chart,
 )
-
-FloatArray = NDArray[np.float64]
 
 SMALLEST_CHANGE = 0.05
 SEASON_DAYS = 364.0

@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from pre_core.arrays import FloatArray
 from pre_core.monitoring.baseline import LEVEL_SPREAD, BaselineState, Innovation, log_sum
-
-FloatArray = NDArray[np.float64]
 
 STEP_SPREAD = 0.15
 """Prior standard deviation s of a step of one element's ln EI."""

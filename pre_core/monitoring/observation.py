@@ -13,14 +13,12 @@ normals z, v = P^-1/2 z. The rest of C is the crossing's own. In logarithms d ln
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.fusion.information import BridgePriors
 from pre_core.fusion.joint import add_mass_parameter
 from pre_core.fusion.likelihood import linearised_likelihood
 from pre_core.fusion.path_groups import FusionInput, path_group_key, path_groups
-
-FloatArray = NDArray[np.float64]
 
 _WEAK = 0.05
 """Precision of a compliance relative to nominal where the crossing does not determine an element.

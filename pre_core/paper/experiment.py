@@ -6,12 +6,10 @@ kg reproduces the rear body frequency and both wheel-hop frequencies of its Tabl
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.physics.bridge import Beam, uniform_beam
 from pre_core.physics.vehicle import HalfCar
-
-FloatArray = NDArray[np.float64]
 
 TRUCK = HalfCar(
     body_mass_kg=8310.0,

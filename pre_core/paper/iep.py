@@ -11,13 +11,11 @@ velocity and a constant bias of any channel change these signals by 1, t and t^2
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.kernels.lanes import kernel
 from pre_core.paper.integrate import IntegratedMotion
 from pre_core.parameters import C_S1, K_S1, K_U1, M_U1
-
-FloatArray = NDArray[np.float64]
 
 
 def iep_signals(

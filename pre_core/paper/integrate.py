@@ -8,11 +8,9 @@ antiderivative of a cubic spline is far better (studies/reproduction.md measures
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.kernels.lanes import compiled
-
-FloatArray = NDArray[np.float64]
 
 
 class IntegratedMotion(NamedTuple):

@@ -9,8 +9,8 @@ moves in the logit.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray, IntArray
 from pre_core.paper.residual import Workspace, residual_batch
 from pre_core.paper.window import PaperWindow
 from pre_core.parameters import D_1
@@ -23,10 +23,6 @@ from pre_core.search.levenberg_marquardt import (
     initial_state,
     polish,
 )
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 
 MAX_STEPS = 60
 """Limit of steps; without noise ten to fifteen reach the minimum (studies/reproduction.md)."""

@@ -13,16 +13,13 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray, IntArray
 from pre_core.kernels.lanes import LANES
 from pre_core.paper.residual import Workspace, objective_batch, workspace
 from pre_core.paper.window import PaperWindow
 from pre_core.parameters import D_1
 from pre_core.search.loop import Termination
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 PARTICLES = 500
 STEPS = 600

@@ -8,8 +8,8 @@ holds everything that does not depend on the parameters.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.kernels.lanes import LANES, fma, fma_scalar, kernel, load, mul, scale, store, sub
 from pre_core.paper.iep import iep_factors, input_profiles
 from pre_core.paper.window import LONGEST_STRETCH, PaperWindow
@@ -22,8 +22,6 @@ from pre_core.physics.beam_basis import (
     modal_filters_one,
 )
 from pre_core.physics.vehicle import masses_above_axles, masses_on_axles
-
-FloatArray = NDArray[np.float64]
 
 
 class Workspace(NamedTuple):

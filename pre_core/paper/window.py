@@ -5,17 +5,14 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray, IntArray
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.paper.iep import iep_signals
 from pre_core.paper.integrate import IntegratedMotion
 from pre_core.physics.beam_basis import BeamBasis, beam_basis
 from pre_core.physics.bridge import locate_element
 from pre_core.physics.simulate import rear_position_m
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 LONGEST_STRETCH = 128
 """Steps of a stretch: four vectors' work arrays of one stretch stay in the L1 cache."""

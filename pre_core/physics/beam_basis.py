@@ -23,9 +23,9 @@ from waiting for the previous sum.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from pre_core.arrays import FloatArray
 from pre_core.kernels.jacobi import diagonalise, diagonalise_one
 from pre_core.kernels.lanes import LANES, add, fma, fma_scalar, kernel, load, mul, store, sub
 from pre_core.parameters import ALPHA, BETA, EI_1, K_ROT, RHO_A, F
@@ -36,9 +36,6 @@ from pre_core.physics.bridge import (
     uniform_beam,
     unit_stiffness_matrices,
 )
-
-FloatArray = NDArray[np.float64]
-
 
 RIGID_M_PER_N = 2e-12
 """Compliance added to every bearing, a hundredth of a micrometre under a heavy axle: without any

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-FloatArray = NDArray[np.float64]
+from pre_core.arrays import FloatArray
 
 
 class Beam(NamedTuple):

@@ -6,11 +6,9 @@ a time step.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.physics.bridge import Beam, Modes, element_cubics, supported_nodes
-
-FloatArray = NDArray[np.float64]
 
 
 def free_motion(modes: Modes, state: FloatArray, seconds: float) -> FloatArray:

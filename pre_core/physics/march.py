@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.kernels.lanes import compiled, exact
 from pre_core.physics.vehicle import air_spring_excess_n, dahl_friction_n
-
-FloatArray = NDArray[np.float64]
 
 
 class WheelForces(NamedTuple):

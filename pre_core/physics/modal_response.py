@@ -18,8 +18,8 @@ restores this part.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.kernels.lanes import LANES, fma, fma_scalar, kernel, load, mul, store
 from pre_core.parameters import RHO_A
 from pre_core.physics.beam_basis import (
@@ -29,8 +29,6 @@ from pre_core.physics.beam_basis import (
     modal_damping,
     shape_cubics,
 )
-
-FloatArray = NDArray[np.float64]
 
 COEFFICIENTS = 5
 """Number of coefficients of a mode: -a_1, -a_2 and b_0, b_1, b_2 over their sum."""

@@ -1,8 +1,8 @@
 """Conversion of a truck and a bridge to one parameter vector and back (parameters.py)."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.parameters import (
     ALPHA,
     BETA,
@@ -19,8 +19,6 @@ from pre_core.parameters import (
 )
 from pre_core.physics.bridge import Beam
 from pre_core.physics.vehicle import HalfCar
-
-FloatArray = NDArray[np.float64]
 
 
 def from_models(car: HalfCar, beam: Beam) -> FloatArray:

@@ -8,12 +8,10 @@ times that.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from pre_core.arrays import FloatArray
 from pre_core.physics.simulate import Motion, WheelRoad, rear_position_m
-
-FloatArray = NDArray[np.float64]
 
 REFERENCE_CYCLES_PER_M = 0.1
 WAVINESS = 2.0

@@ -12,12 +12,10 @@ so that white noise at the output rate f_s has the standard deviation d sqrt(f_s
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
-
-FloatArray = NDArray[np.float64]
 
 _STOP_BAND_DB = 90.0
 _PASS_SHARE = 0.8  # pass band of the anti-aliasing filter, relative to half the output rate

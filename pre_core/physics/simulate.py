@@ -7,8 +7,8 @@ exchange wheel displacement and contact force until the forces converge (paper s
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.physics import bridge as _bridge
 from pre_core.physics import vehicle as _vehicle
@@ -22,8 +22,6 @@ from pre_core.physics.march import (
     march,
 )
 from pre_core.physics.torsional_modes import quasi_static_twist, torsional_modes
-
-FloatArray = NDArray[np.float64]
 
 
 class Motion(NamedTuple):

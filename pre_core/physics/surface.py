@@ -14,12 +14,9 @@ along every line has the density of ISO 8608, G_d(n_0) (n/n_0)^-2: Phi = G_d n_0
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import ComplexArray, FloatArray
 from pre_core.physics.road import GEOMETRIC_MEAN_M3, REFERENCE_CYCLES_PER_M, Profile
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _WIDEST_CYCLES_PER_M = 40.0
 """Largest lateral frequency in cycles/m; tyres average shorter waves out."""

@@ -28,12 +28,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import ComplexArray, FloatArray
 from pre_core.kernels.lanes import kernel
 from pre_core.parameters import C_S1, C_U1, D_1, K_S1, K_U1, KAPPA, M_U1, SHARE
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
 
 _DAMPED = 0.4
 """Smallest size of G for which the front axle's answer counts in full (`lead_response`)."""

@@ -20,12 +20,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.kernels.lanes import LANES, kernel
 from pre_core.parameters import TORSION
 from pre_core.physics.beam_basis import modal_damping
 from pre_core.physics.modal_response import COEFFICIENTS, mode_coefficients
-
-FloatArray = NDArray[np.float64]
 
 GROUPS = 2
 """Number of groups of `LANES` modes for each span, one mode in each vector lane."""

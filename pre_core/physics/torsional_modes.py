@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pre_core.physics.bridge import Beam, FloatArray
+from pre_core.arrays import FloatArray
+from pre_core.physics.bridge import Beam
 from pre_core.physics.torsion import sine_cubics, span_ends_m
 
 _MODES = 40

@@ -7,12 +7,11 @@ from the equilibrium on a flat road, up positive: z = [z_s1, z_s2, z_u1, z_u2].
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from pre_core.arrays import FloatArray
 from pre_core.kernels.lanes import kernel
 
-FloatArray = NDArray[np.float64]
 Pair = tuple[float, float]
 
 _LEAST_HEIGHT = 0.05

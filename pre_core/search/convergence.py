@@ -4,9 +4,8 @@ Gelman et al., Bayesian Data Analysis (3rd edition), sections 11.4 and 11.5.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pre_core.arrays import FloatArray
 
 CHAINS = 8
 """Number of chains; `split_r_hat` compares their sixteen halves."""

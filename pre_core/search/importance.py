@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-FloatArray = NDArray[np.float64]
+from pre_core.arrays import FloatArray
 
 _MAX_ROUNDS, _SAME_SCALE = 50, 1e-6
 """Limit of the rounds in which densities are scaled alike, and the change that ends them."""

@@ -8,12 +8,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 
+from pre_core.arrays import FloatArray
 from pre_core.search.loop import SearchResult, Termination, run_search
-
-FloatArray = NDArray[np.float64]
 
 _FIRST_DAMPING = 1e-3
 """Initial damping relative to the Jacobian's columns: nearly a Gauss-Newton step."""

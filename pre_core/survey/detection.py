@@ -10,12 +10,10 @@ A loss L changes c from 1 to 1/(1 - L).
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from pre_core.arrays import FloatArray
 from pre_core.survey.plan import BridgePrior
-
-FloatArray = NDArray[np.float64]
 
 FALSE_ALARM = 0.01
 """Probability of a false alarm for each tested element without a loss."""

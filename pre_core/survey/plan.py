@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import posterior
 from pre_core.crossing.compliances import draws, from_normal, marginal
 from pre_core.crossing.fit import Optimum
@@ -31,8 +32,6 @@ from pre_core.fusion.likelihood import (
 from pre_core.fusion.path_groups import low_rank_root
 from pre_core.search import levenberg_marquardt
 from pre_core.search.loop import Termination
-
-FloatArray = NDArray[np.float64]
 
 _DRAWS, _CHAINS = 1000, 2
 """Number of draws, which give a standard deviation to 2 %, and of chains."""

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.paper import experiment
 from schemas.messages import decode
@@ -32,6 +31,7 @@ from schemas.site_file import site_toml
 from services.bus.playback import set_by_signals
 from services.bus.session import open_session
 from services.bus.subscription import RawSample, Subscription
+from services.common.arrays import Floats
 from services.common.errors import FailureError, InputError
 from services.common.files import write_atomically
 from services.common.interrupts import handled_by
@@ -49,7 +49,6 @@ from services.simulation.drive import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-Floats = NDArray[np.float64]
 Live = Literal["window", "web"]
 """Display of a running demo."""
 

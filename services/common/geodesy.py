@@ -9,11 +9,10 @@ from math import cos, hypot, radians, sin, sqrt
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from schemas.wgs84 import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
-
-Floats = NDArray[np.float64]
+from services.common.arrays import Floats
 
 
 class BridgeEnds(Protocol):

@@ -14,9 +14,9 @@ them to a truck's messages:
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.common.files import check_ordinary
 from services.drives.runs import (
@@ -25,8 +25,6 @@ from services.drives.runs import (
     resample,
     sampling_rate_hz,
 )
-
-Floats = NDArray[np.float64]
 
 _ACCELEROMETER = "processed_log_IMU_accelerometer"
 _RECEIVER = "processed_log_GNSS_live_gnss_ublox"

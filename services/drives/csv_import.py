@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.signals import (
     CHANNELS,
@@ -21,12 +20,11 @@ from schemas.signals import (
     MAX_RATE_HZ,
 )
 from schemas.topics import IDENTIFIER
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.common.files import read_text
 from services.common.progress import Steps, no_step_progress
 from services.drives.runs import GnssTrack, Run, sampling_rate_hz
-
-Floats = NDArray[np.float64]
 
 _CHANNEL: Final = re.compile(IDENTIFIER)
 GPS_COLUMNS: Final = ("time_s", "latitude_deg", "longitude_deg", "altitude_m", "speed_mps")

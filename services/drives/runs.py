@@ -24,9 +24,8 @@ from schemas.signals import (
 from schemas.site import Sensor, Site
 from schemas.site_file import vehicle_toml
 from schemas.topics import Key, Message
+from services.common.arrays import Floats
 from services.common.extras import check_installed
-
-Floats = NDArray[np.float64]
 
 BATCH_S = 0.05
 """Length of a truck's batches in s: few messages with a low delay."""

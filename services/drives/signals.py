@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from schemas.signals import AccelBatch, AccelChannel, GnssFix, in_order
 from schemas.site import Site
+from services.common.arrays import Floats
 from services.common.extras import check_installed
 from services.common.field_docs import with_field_docs
 from services.common.progress import Offset, no_progress
@@ -21,7 +22,6 @@ from services.recordings.recording import read_messages
 if TYPE_CHECKING:
     import pandas as pd
 
-Floats = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]
 
 

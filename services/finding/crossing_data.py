@@ -3,15 +3,11 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from schemas.reasons import Reason
 from schemas.site import Bridge, Receiver, Sensor, Vehicle
+from services.common.arrays import Floats
 from services.finding.stays import Stay
 from services.finding.streams import Fixes, Samples
-
-Floats = NDArray[np.float64]
 
 _MARGIN_S = 1.0
 """Time in s before the entry and after the exit for which samples are required."""

@@ -10,7 +10,6 @@ from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing.middle import (
@@ -25,8 +24,7 @@ from schemas.reasons import Reason
 from schemas.signals import CHANNELS
 from schemas.site import Sensor, Site, Vehicle
 from schemas.site_sensors import IN_THE_MIDDLE_M, PlacedSensor
-
-Floats = NDArray[np.float64]
+from services.common.arrays import Floats
 
 _SLACK = 2.5
 """Standard deviations of gains and delays by which redundant sensors may differ.

@@ -18,15 +18,12 @@ from enum import Enum
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.signals import NS_PER_S
 from schemas.site import Bridge, Receiver
+from services.common.arrays import Floats, Ints
 from services.common.geodesy import BridgeFrame, to_chainage
 from services.finding.streams import Fixes
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 CORRIDOR_M = 30.0
 """Largest lateral distance of a fix in m: a carriageway's width and a poor receiver."""

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import MAX_BATCH_S, MAX_CHANNELS, NS_PER_S, AccelBatch, GnssFix, in_order
+from services.common.arrays import Floats
 
-Floats = NDArray[np.float64]
 TruckMessage = TypeVar("TruckMessage", bound=pb.AccelBatch | pb.GnssFix | pb.VehicleInfo)
 
 PATIENCE_S = 10.0

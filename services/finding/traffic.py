@@ -11,8 +11,9 @@ import numpy as np
 
 from schemas.signals import GnssFix
 from schemas.site import Vehicle
+from services.common.arrays import Floats
 from services.finding.bridges import Bridges
-from services.finding.stays import LONGEST_UNSEEN_S, AxleGeometry, Floats, Stay
+from services.finding.stays import LONGEST_UNSEEN_S, AxleGeometry, Stay
 from services.finding.streams import Fixes
 
 _MAX_TRUCKS: Final = 1000

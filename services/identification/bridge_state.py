@@ -22,6 +22,7 @@ from schemas.results import (
     Parameter,
     ThirdsState,
 )
+from services.common.arrays import Floats
 from services.identification.comparison import (
     Comparison,
     compare,
@@ -29,7 +30,7 @@ from services.identification.comparison import (
     estimate_of_state,
     unresolved_elements,
 )
-from services.identification.fusing import Floats, FusedBridge, fused
+from services.identification.fusing import FusedBridge, fused
 from services.identification.result_parts import part_of_elements
 from services.identification.usable import LISTED_AT_MOST as LISTED_AT_MOST
 from services.identification.usable import FusableCrossing

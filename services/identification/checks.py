@@ -17,8 +17,8 @@ from pre_core.diagnostics.converter import converter_step
 from schemas.reasons import Reason
 from schemas.site import Vehicle
 from schemas.site_vehicle import axle_loads_kg
+from services.common.arrays import Floats
 from services.finding.crossing_data import CrossingData
-from services.identification.result_parts import Floats
 from services.identification.signal_checks import body_constants
 
 _BANDS_HZ = np.array([0.0, 6.0, 12.0, 30.0, np.inf])

@@ -11,13 +11,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.constants import NORMAL_975
 from schemas.results import RESOLVED, BridgeResult, ElementState, Parameter
+from services.common.arrays import Floats
 from services.common.language import ENGLISH, Language
-
-Floats = NDArray[np.float64]
 
 CLEAR_LOSS = 0.1
 """Smallest stiffness loss that the whole 95 % interval of a weak element must exceed."""

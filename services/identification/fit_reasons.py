@@ -19,6 +19,7 @@ from pre_core.crossing.rows import RESIDUALS
 from pre_core.crossing.tandem_friction import tandem_friction
 from pre_core.search.loop import Termination
 from schemas.reasons import Reason
+from services.common.arrays import Floats
 from services.finding.crossing_data import CrossingData
 from services.finding.placed import first_axle, middle_names
 from services.identification.checks import (
@@ -31,7 +32,6 @@ from services.identification.checks import (
     undeclared_axles,
     weak_excitation,
 )
-from services.identification.result_parts import Floats
 
 _UNEXPLAINED_CHI2 = 3.0
 """Value of chi2 off the bridge, fitted to that alone, from which the truck is not explained."""

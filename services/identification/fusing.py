@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core import parameters
 from pre_core.crossing.fit import Optimum
@@ -22,10 +21,9 @@ from pre_core.physics.surface import Footprint
 from pre_core.search.loop import Report
 from schemas import fusion
 from schemas.results import Track
+from services.common.arrays import Floats
 from services.finding.crossing_data import CrossingData
 from services.identification.usable import Source
-
-Floats = NDArray[np.float64]
 
 _DIGITS = 9
 """Significant digits of a likelihood: rounding moves an estimate by 1e-6 of its uncertainty."""

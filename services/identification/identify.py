@@ -19,6 +19,7 @@ from pre_core.search.loop import Report
 from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
+from services.common.arrays import Floats
 from services.finding.crossing_data import CrossingData, Window
 from services.finding.placed import Spreads, middle_of, one_sided_channels
 from services.finding.stays import STANDING_M_PER_S, Passage
@@ -27,13 +28,7 @@ from services.identification.methods import METHODS, IdentificationMethod
 from services.identification.paper_method import identify_paper
 from services.identification.pre_method import Keep as Keep
 from services.identification.pre_method import MethodRun, identify_pre
-from services.identification.result_parts import (
-    CrossingTimes,
-    Cut,
-    Floats,
-    longest_outage_s,
-    rejected,
-)
+from services.identification.result_parts import CrossingTimes, Cut, longest_outage_s, rejected
 from services.identification.signal_checks import reasons_before_fit, unmeasured
 
 _log = logging.getLogger(__name__)

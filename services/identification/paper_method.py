@@ -23,10 +23,10 @@ from pre_core.search.loop import Report
 from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
+from services.common.arrays import Floats
 from services.finding.crossing_data import CrossingData
 from services.identification.result_parts import (
     CrossingTimes,
-    Floats,
     beam_of,
     caveats,
     detrended,

@@ -26,6 +26,7 @@ from schemas import results
 from schemas.reasons import Reason, texts
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge
+from services.common.arrays import Floats
 from services.finding.crossing_data import CrossingData
 from services.finding.placed import first_axle
 from services.identification.checks import stiffer_elements, undeclared_axles
@@ -41,7 +42,6 @@ from services.identification.lane import lane_factor
 from services.identification.result_parts import (
     CrossingTimes,
     Cut,
-    Floats,
     caveats,
     detrended,
     header,

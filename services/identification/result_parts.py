@@ -4,7 +4,6 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core import parameters
 from pre_core.constants import NORMAL_975
@@ -16,10 +15,9 @@ from schemas import results
 from schemas.reasons import Reason, texts
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Vehicle
+from services.common.arrays import Floats
 from services.finding.crossing_data import CrossingData
 from services.identification.methods import LONGEST_SURE_OUTAGE_S
-
-Floats = NDArray[np.float64]
 
 _ROAD_SPACING_M = 0.05
 """Spacing in m, finer than a tyre's patch of some 0.2 m."""

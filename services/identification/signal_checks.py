@@ -8,16 +8,14 @@ from collections.abc import Callable, Mapping
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.diagnostics import frozen, quality, same_place
 from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason
 from schemas.site import Vehicle
+from services.common.arrays import Floats
 from services.finding import placed
-
-Floats = NDArray[np.float64]
 
 # Fault-free: 300 simulated crossings, no false accusation (studies/faults.md).
 LONGEST_HOLD_S = 0.2

@@ -10,13 +10,12 @@ from pre_core.diagnostics import quality, same_place
 from pre_core.physics.simulate import Motion
 from schemas.reasons import REASON_TEXTS, Reason
 from schemas.site import Sensor, Vehicle
+from services.common.arrays import Floats
 from services.finding import placed
 from services.finding.placed import rates_hz
 from services.identification import signal_checks
 from services.inspection.finding import CheckFinding, CheckStatus, check_finding
 from services.inspection.recorded import InspectedRun
-
-Floats = NDArray[np.float64]
 
 _LARGEST_RATE_ERROR: Final = 0.02
 """Largest relative error of a rate: a crystal has 1e-4, more is another setting."""

@@ -12,6 +12,7 @@ from pre_core.physics.simulate import Motion
 from schemas.site import Site, Vehicle
 from schemas.site_file import parse_site, read_site_text
 from schemas.site_usual import of_frequencies
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.common.progress import Offset, no_progress
 from services.finding.placed import densities_ug_per_rthz, middle_of
@@ -34,8 +35,6 @@ from services.inspection.receiver import clocks, longest_standstill, receiver_of
 from services.inspection.recorded import InspectedRun, recorded_runs
 from services.inspection.site import finding_of_implied, findings_of_site
 from services.recordings.recording import read_info
-
-Floats = NDArray[np.float64]
 
 _SHORTEST_STANDSTILL_S: Final = 10.0
 _SHORTEST_DRIVE_S: Final = 6.0

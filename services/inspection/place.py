@@ -4,17 +4,15 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.site import Bridge, Receiver, Vehicle
+from services.common.arrays import Floats
 from services.common.geodesy import bridge_frame, to_chainage
 from services.finding.crossing_data import AFTER_M, APPROACH_M, LONGEST_MARGIN_S
 from services.finding.stays import CORRIDOR_M, Passage, Stay, stays_on
 from services.identification.identify import SLOWEST_M_PER_S
 from services.inspection.finding import CheckFinding, CheckStatus, check_finding
 from services.inspection.recorded import InspectedRun
-
-Floats = NDArray[np.float64]
 
 _SHORT: Final = 0.4
 _NEAR_M: Final = 300.0

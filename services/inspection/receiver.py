@@ -4,16 +4,14 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.site import Receiver
+from services.common.arrays import Floats
 from services.common.geodesy import on_plane_m
 from services.finding.stays import STANDING_M_PER_S
 from services.identification.methods import LONGEST_SURE_OUTAGE_S
 from services.inspection.finding import CheckFinding, CheckStatus, check_finding
 from services.inspection.recorded import ClockSeries, InspectedRun
-
-Floats = NDArray[np.float64]
 
 _LOWEST_RATE_HZ: Final = 0.9
 _SMALLEST_JUMP_M: Final = 5.0

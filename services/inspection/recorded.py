@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.signals import NS_PER_S, AccelBatch, GnssFix
 from schemas.site import Site
 from schemas.topics import Message
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.common.progress import Offset, no_progress
 from services.drives.importing import normalised_runs, vehicle_of
@@ -18,8 +18,6 @@ from services.drives.runs import run_to_messages
 from services.finding.drive import DriveMessages, drives_of
 from services.finding.streams import Boot, Fixes, Samples, boot_of
 from services.recordings.recording import read_messages
-
-Floats = NDArray[np.float64]
 
 _REALM: Final = "import-check"
 _LONGEST_S: Final = 1800.0

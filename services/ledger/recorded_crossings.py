@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.settings import IdentificationSettings
 from schemas.signals import NS_PER_S, decode_gnss
 from schemas.site import Site
 from schemas.topics import Message
+from services.common.arrays import Ints
 from services.common.errors import InputError
 from services.finding.bridges import Bridges
 from services.finding.crossing_data import Complete
@@ -33,8 +33,6 @@ from services.identification.names import Names
 from services.identification.outputs import IdentificationTask, Output, crossing_output
 from services.identification.waiting import CrossingFromRecording, pending_of
 from services.recordings.recording import is_being_written, read_messages
-
-Ints = NDArray[np.int64]
 
 AROUND_NS: Final = 60 * NS_PER_S
 """Time read before and after a crossing, for the sense of travel and for late messages."""

@@ -4,16 +4,14 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.results import CrossingResult, Prior
+from services.common.arrays import Floats
 from services.common.extras import check_installed
 from services.history.draws import DrawsOfCrossing, posterior
 
 if TYPE_CHECKING:
     import xarray as xr
-
-Floats = NDArray[np.float64]
 
 _DRAWS: Final = 2000
 _SEED: Final = 1

@@ -34,8 +34,6 @@ from services.simulation.drive_tandem import TandemDrive, tandem_case
 from services.simulation.wheel_paths import REAR_OFFSET_M
 from services.simulation.wide_crossings import drive_case
 
-Floats = NDArray[np.float64]
-
 _SETTINGS = IdentificationSettings(method="pre", threads=1)
 _ROAD_SEED = 1
 _MEDIAN_OF_HALF_NORMAL = 0.6745

@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from pre_core.survey.detection import DETECTION_PROBABILITY
+from services.common.arrays import Floats
 from services.planning.advice import tyres_of
 from services.planning.survey import SurveyForecast
 from services.viewer.drawing import (
@@ -23,8 +23,6 @@ from services.viewer.drawing import (
     simplify_axes,
     write_figure,
 )
-
-Floats = NDArray[np.float64]
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#1b1f24")
 """Okabe and Ito's colours, distinguishable by all eyes."""

@@ -5,7 +5,6 @@ from contextlib import suppress
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.survey import detection
 from pre_core.survey.plan import (
@@ -17,11 +16,10 @@ from pre_core.survey.plan import (
     survey_spreads,
 )
 from schemas.site import Bridge, Site
+from services.common.arrays import Floats
 from services.common.errors import FailureError
 from services.planning.alternatives import Plan, alternatives, as_planned
 from services.planning.crossings import CrossingSimulator, PlannedCrossing, PlannedRoad, scale_error
-
-Floats = NDArray[np.float64]
 
 _JOINED_M: Final = 1e-6
 MAX_CROSSINGS: Final = 300

@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core import parameters
 from pre_core.physics.bridge import Beam
@@ -30,6 +29,7 @@ from schemas.reasons import Reason
 from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Sensor, Site, Vehicle
+from services.common.arrays import Floats
 from services.drives.runs import Run, run_to_messages
 from services.finding.crossing_data import CrossingData
 from services.finding.finder import crossings_in
@@ -50,8 +50,6 @@ from services.simulation.drive import (
 )
 from services.simulation.positions import Instruments, TimedMotion, receiver_of
 from services.simulation.wheel_paths import WheelPaths
-
-Floats = NDArray[np.float64]
 
 REALM = "sim-calibration"
 _BEFORE_S, _AFTER_S = 4.0, 3.5

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.paper import experiment
@@ -37,6 +37,7 @@ from pre_core.physics.vehicle import HalfCar, static_axle_loads_n
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle
 from schemas.site_file import parse_site, site_toml
+from services.common.arrays import Floats
 from services.common.errors import FailureError, InputError
 from services.drives.runs import Run, run_to_messages
 from services.recordings.writer import write_recording
@@ -55,8 +56,6 @@ from services.simulation.wheel_paths import (
     WheelPaths,
     roads_of_surface,
 )
-
-Floats = NDArray[np.float64]
 
 _PARTS = 10
 _MODES = 40

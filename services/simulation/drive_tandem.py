@@ -6,12 +6,12 @@ The plane simulation of `drive` has two axles; this one has a left and a right s
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from schemas.site import Bridge, Site, Vehicle
 from schemas.site_axle_tables import Axle
 from schemas.site_file import site_toml
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.common.progress import steps_bar
 from services.drives.runs import run_to_messages
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
-
-Floats = NDArray[np.float64]
 
 _ROLL_GYRATION_M: Final = 0.85
 _FRONT_TRACK_M: Final = 2.05

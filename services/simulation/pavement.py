@@ -13,12 +13,10 @@ Only simulations have these; the method knows none of their ranges or shapes.
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.physics.road import Profile
 from pre_core.physics.surface import Footprint, response
-
-Floats = NDArray[np.float64]
+from services.common.arrays import Floats
 
 JOINT_WIDTH_M: Final = (0.05, 0.30)
 JOINT_SHARE: Final = (0.3, 1.0)

@@ -4,15 +4,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.physics.sensors import Accelerometer, ReceiverModel, measure_position
 from pre_core.physics.simulate import Motion
 from schemas.site import Bridge, Site
+from services.common.arrays import Floats
 from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
 from services.drives.runs import GnssTrack
-
-Floats = NDArray[np.float64]
 
 START_TIME_S = 1_767_225_600.0
 """Start of simulated drives, 2026-01-01 00:00 UTC, so that the same call gives the same file."""

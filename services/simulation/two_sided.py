@@ -16,9 +16,9 @@ with their shares, and which loads them in the same shares. Friction follows Dah
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
+from services.common.arrays import Floats, Ints
 from services.simulation.two_sided_deck import Deck, exact_modes
 from services.simulation.two_sided_march import (
     TruckSystem,
@@ -26,9 +26,6 @@ from services.simulation.two_sided_march import (
     WideResponse,
     march_exactly,
 )
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 LONGEST_STEP_S: Final = 5e-4
 _KINGPIN_N_PER_M: Final = 2e7
@@ -132,7 +129,7 @@ class WideRoad(NamedTuple):
 class WideTyres(NamedTuple):
     """All tyres of a truck: (tyres,) each, axle by axle, the left side first."""
 
-    axle: Integers
+    axle: Ints
     lateral_m: Floats
     """Distance to the left of the truck's centre line."""
     share: Floats

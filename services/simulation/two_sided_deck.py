@@ -10,10 +10,9 @@ both.
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import eigh, expm
 
-Floats = NDArray[np.float64]
+from services.common.arrays import Floats
 
 _CELLS: Final = 70
 """Fewest finite elements of the bridge."""

@@ -9,13 +9,10 @@ classical steps. The bridge moves only while a wheel is on it.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.kernels.lanes import compiled
+from services.common.arrays import Floats, Ints
 from services.simulation.two_sided_deck import ExactModes
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 class TruckSystem(NamedTuple):
@@ -47,7 +44,7 @@ class WheelCourse(NamedTuple):
     speed: Floats  # (half steps,)
     acceleration: Floats  # (half steps,)
     transfer: Floats  # (n,): forces on the coordinates over the acceleration
-    tyre_axle: Integers  # (tyres,)
+    tyre_axle: Ints  # (tyres,)
     lateral: Floats  # (tyres,): to the left of the bridge's axis
     height: Floats  # (half steps, tyres)
     rate: Floats  # (half steps, tyres)

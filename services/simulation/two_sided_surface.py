@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.kernels.lanes import compiled
+from services.common.arrays import Floats
 
-Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 _CLASSES: Final = "ABCDE"

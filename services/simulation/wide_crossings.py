@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.constants import MICRO_G_M_PER_S2
 from schemas.site import Site
 from schemas.site_file import parse_site, toml_of
+from services.common.arrays import Floats
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run
 from services.simulation.two_sided import (
@@ -31,8 +31,6 @@ from services.simulation.two_sided import (
 from services.simulation.two_sided_deck import Deck
 from services.simulation.two_sided_march import WideResponse
 from services.simulation.two_sided_surface import Strip, Waves, draw_waves, heights_m
-
-Floats = NDArray[np.float64]
 
 START_TIME_S: Final = 1_796_300_000.0
 BETWEEN_RUNS_S: Final = 600.0

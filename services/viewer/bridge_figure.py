@@ -13,9 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from services.common.arrays import Floats
 from services.common.language import ENGLISH, Language
 from services.viewer.bridge_view import BridgeView, describe_bridge, origin_of
-from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView, FloatArray
+from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView
 from services.viewer.drawing import (
     BANNERS,
     BAR_EDGE,
@@ -153,7 +154,7 @@ def _meaning(bridge: BridgeView) -> str:
     return "ratio" if bridge.baseline is None or bridge.comparison is None else "change"
 
 
-def _numbers(bridge: BridgeView, mean: FloatArray, language: Language) -> list[str]:
+def _numbers(bridge: BridgeView, mean: Floats, language: Language) -> list[str]:
     """Return the number of each bar, all with one meaning."""
     if _meaning(bridge) == "change":
         assert bridge.comparison is not None  # noqa: S101 - its meaning says so
@@ -181,7 +182,7 @@ def _draw_before(axes: Axes, bridge: BridgeView, places: BarPlaces, language: La
 
 def _draw_crossings(
     axes: Axes, bridge: BridgeView, places: BarPlaces, language: Language
-) -> FloatArray:
+) -> Floats:
     """Draw the estimates of single crossings next to the interval; return the highest (n,)."""
     drawn = [c for c in bridge.crossings if c.rigidity_nm2 is not None]
     highest = np.zeros(places.centres_m.size)

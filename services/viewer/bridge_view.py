@@ -12,6 +12,7 @@ import numpy as np
 from schemas.reasons import Reason
 from schemas.results import BridgeResult, CrossingResult, Results
 from schemas.site import Bridge, Site
+from services.common.arrays import Floats
 from services.common.language import ENGLISH, Language
 from services.identification import comparison
 from services.identification.comparison import (
@@ -23,11 +24,7 @@ from services.identification.comparison import (
     unresolved_elements,
 )
 from services.viewer.baseline import named_baseline
-from services.viewer.crossing_view import (
-    CrossingView,
-    FloatArray,
-    view_of_crossing,
-)
+from services.viewer.crossing_view import CrossingView, view_of_crossing
 
 
 class BridgeView(NamedTuple):
@@ -35,8 +32,8 @@ class BridgeView(NamedTuple):
 
     bridge: str
     owner_id: str | None
-    edges_m: FloatArray  # (n + 1,)
-    nominal_nm2: FloatArray  # (n,)
+    edges_m: Floats  # (n + 1,)
+    nominal_nm2: Floats  # (n,)
     interior_supports_m: tuple[float, ...]
     crossings: tuple[CrossingView, ...]
     """Crossings in order of time."""

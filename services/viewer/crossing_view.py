@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.results import CrossingResult, Prior, first_compared_axle, unresolved_note
+from services.common.arrays import Floats
 from services.identification.comparison import (
     Comparison,
     Estimate,
@@ -16,8 +16,6 @@ from services.identification.comparison import (
     sentences,
     unresolved_elements,
 )
-
-FloatArray = NDArray[np.float64]
 
 VEHICLE_COLOURS = {
     "front": "#0072B2",
@@ -85,9 +83,9 @@ class DetectedCrossingView(NamedTuple):
 class RoadView(NamedTuple):
     """Road profiles over chainage, all of one length, m."""
 
-    x_m: FloatArray
-    front_m: FloatArray
-    rear_m: FloatArray
+    x_m: Floats
+    front_m: Floats
+    rear_m: Floats
 
     @property
     def largest_m(self) -> float:
@@ -109,12 +107,12 @@ class ParameterRow(NamedTuple):
 class ResidualCells(NamedTuple):
     """Residual bins of a fit, in multiples of the declared noise power: 1 is expected."""
 
-    mean_square: FloatArray
+    mean_square: Floats
     """Mean squares (3, 3, b): kinds, segments and bands; NaN without data.
 
     The kinds are profiles, front and rear body; the segments before, on and after the bridge.
     """
-    excess_std: FloatArray
+    excess_std: Floats
     """Excess (3, 3, b) over 1, in standard deviations of chance."""
     edges_hz: tuple[float, ...]
     """Band edges (b + 1,), the last one infinite."""
@@ -139,10 +137,10 @@ class CrossingView(NamedTuple):
     reasons: tuple[str, ...]
     reason_texts: tuple[str, ...]
     chi2_per_dof: float | None
-    element_edges_m: FloatArray
-    nominal_nm2: FloatArray
-    rigidity_nm2: FloatArray | None
-    interval_nm2: FloatArray | None  # (n, 2): 2.5 % and 97.5 % points
+    element_edges_m: Floats
+    nominal_nm2: Floats
+    rigidity_nm2: Floats | None
+    interval_nm2: Floats | None  # (n, 2): 2.5 % and 97.5 % points
     road: RoadView | None
     parameters: tuple[ParameterRow, ...]
     interior_supports_m: tuple[float, ...] = ()
@@ -177,7 +175,7 @@ class CrossingView(NamedTuple):
         return float(self.element_edges_m[-1])
 
     @property
-    def resolved_ratio(self) -> FloatArray | None:
+    def resolved_ratio(self) -> Floats | None:
         """EI over nominal (n,), NaN for an unresolved element; None if rejected."""
         if self.rigidity_nm2 is None:
             return None
@@ -199,7 +197,7 @@ class CrossingView(NamedTuple):
         return self.verdict != "good" or not self.interval_has_meaning
 
 
-def front_axle_chainage(crossing: CrossingSpan, time_s: FloatArray) -> FloatArray:
+def front_axle_chainage(crossing: CrossingSpan, time_s: Floats) -> Floats:
     """Return the front axle's chainage (n,), m, at the mean speed: for display only."""
     travelled = crossing.speed_m_per_s * (time_s - crossing.entry_time_s)
     return travelled if crossing.forward else crossing.span_m - travelled

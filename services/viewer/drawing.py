@@ -20,14 +20,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
+from services.common.arrays import Floats
 from services.common.files import write_atomically
 from services.common.language import ENGLISH, Language
-from services.viewer.crossing_view import (
-    TRUTH_COLOUR,
-    VEHICLE_COLOURS,
-    VERDICT_COLOURS,
-    FloatArray,
-)
+from services.viewer.crossing_view import TRUTH_COLOUR, VEHICLE_COLOURS, VERDICT_COLOURS
 
 WIDTH_IN, DPI = 9.0, 200  # 1800 pixels: sharp at the 900 of a repository page
 
@@ -152,11 +148,11 @@ def draw_verdict(
 class BarPlaces(NamedTuple):
     """Places of the bars of elements along the bridge, m."""
 
-    centres_m: FloatArray  # (n,)
-    lengths_m: FloatArray  # (n,)
+    centres_m: Floats  # (n,)
+    lengths_m: Floats  # (n,)
 
 
-def bar_places(edges_m: FloatArray, begin: float = 0.0, end: float = 1.0) -> BarPlaces:
+def bar_places(edges_m: Floats, begin: float = 0.0, end: float = 1.0) -> BarPlaces:
     """Return the places of bars that take this part of each element; `edges_m` is (n + 1,)."""
     lengths = np.diff(edges_m)
     return BarPlaces(edges_m[:-1] + 0.5 * (begin + end) * lengths, (end - begin) * lengths)
@@ -165,7 +161,7 @@ def bar_places(edges_m: FloatArray, begin: float = 0.0, end: float = 1.0) -> Bar
 def draw_bars(
     axes: Axes,
     places: BarPlaces,
-    heights: FloatArray,
+    heights: Floats,
     weak: set[int],
     *,
     doubtful: bool,
@@ -211,7 +207,7 @@ def draw_bars(
 
 
 def draw_intervals(
-    axes: Axes, places: BarPlaces, low: FloatArray, high: FloatArray, *, colour: str, label: str
+    axes: Axes, places: BarPlaces, low: Floats, high: Floats, *, colour: str, label: str
 ) -> None:
     """Draw the interval of each element."""
     centres, half = places.centres_m, 0.09 * places.lengths_m
@@ -223,8 +219,8 @@ def draw_intervals(
 def label_losses(
     axes: Axes,
     places: BarPlaces,
-    low: FloatArray,
-    high: FloatArray,
+    low: Floats,
+    high: Floats,
     losses: Mapping[int, str],
 ) -> None:
     """Label the losses of elements, by their numbers, above their intervals and their values."""
@@ -243,9 +239,7 @@ def label_losses(
         )
 
 
-def label_bars(
-    axes: Axes, places: BarPlaces, low: FloatArray, high: FloatArray, texts: list[str]
-) -> None:
+def label_bars(axes: Axes, places: BarPlaces, low: Floats, high: Floats, texts: list[str]) -> None:
     """Write a number below each interval, or above where the bar is too low; and its name."""
     small = 8.5 if len(texts) > 11 else 10.5
     above = _are_low(low, high)
@@ -275,9 +269,7 @@ def label_bars(
         )
 
 
-def top_above_labels(
-    axes: Axes, low: FloatArray, high: FloatArray, labelled: Iterable[int] = ()
-) -> float:
+def top_above_labels(axes: Axes, low: Floats, high: Floats, labelled: Iterable[int] = ()) -> float:
     """Return the end of a vertical axis from 0 below which all labels above intervals stay.
 
     `labelled` are the numbers of the elements with a loss above their interval.
@@ -291,12 +283,12 @@ def top_above_labels(
     return float(np.max(high / (1.0 - needed_pt / height_pt)))
 
 
-def _are_low(low: FloatArray, high: FloatArray) -> Sequence[bool]:
+def _are_low(low: Floats, high: Floats) -> Sequence[bool]:
     """Return for each bar whether a number and a name do not fit below its interval."""
     return [bool(one) for one in low < 0.36 * high.max()]
 
 
-def add_ratio_axis(axes: Axes, nominal: FloatArray, language: Language = ENGLISH) -> None:
+def add_ratio_axis(axes: Axes, nominal: Floats, language: Language = ENGLISH) -> None:
     """Mark ratios at the right, if all elements share one nominal value, by a twin axis."""
     if np.ptp(nominal) > 1e-9 * nominal.max():
         return

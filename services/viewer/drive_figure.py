@@ -14,8 +14,9 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 
 from schemas.signals import AccelBatch
+from services.common.arrays import Floats
 from services.drives.runs import Run
-from services.viewer.crossing_view import CrossingSpan, FloatArray
+from services.viewer.crossing_view import CrossingSpan
 from services.viewer.drawing import (
     GRID,
     INK,
@@ -39,9 +40,9 @@ _GAP_S = 3.0
 class Envelope(NamedTuple):
     """Smallest and largest values of a signal in pieces of the time, all (k,)."""
 
-    time_s: FloatArray
-    low: FloatArray
-    high: FloatArray
+    time_s: Floats
+    low: Floats
+    high: Floats
 
 
 def draw_drive(vehicle: str, signals: VehicleSignals, crossings: Sequence[CrossingSpan]) -> Figure:
@@ -64,8 +65,8 @@ def run_picture(run: Run) -> bytes:
 def _draw(
     title: str,
     curves: Mapping[str, Envelope],
-    fix_time_s: FloatArray,
-    speed_m_per_s: FloatArray,
+    fix_time_s: Floats,
+    speed_m_per_s: Floats,
     crossings: Sequence[CrossingSpan],
 ) -> Figure:
     figure = Figure(figsize=(WIDTH_IN, _HEIGHT_IN), facecolor="white")
@@ -120,7 +121,7 @@ def _of_batches(batches: Sequence[AccelBatch], channel: str) -> Envelope:
     return Envelope(*np.array(rows, dtype=np.float64).reshape(-1, 3).T)
 
 
-def _of_samples(time_s: FloatArray, values: FloatArray) -> Envelope:
+def _of_samples(time_s: Floats, values: Floats) -> Envelope:
     """Return the envelope of even samples (n,)."""
     size = -(-values.size // _MAX_RANGES) or 1
     first = np.arange(0, values.size, size)
@@ -131,14 +132,14 @@ def _of_samples(time_s: FloatArray, values: FloatArray) -> Envelope:
     )
 
 
-def _interrupted(time_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _interrupted(time_s: Floats, values: Floats) -> tuple[Floats, Floats]:
     """Return times and values (n,) with a NaN in every gap, where a line then breaks."""
     gaps = np.flatnonzero(np.diff(time_s) > _GAP_S) + 1
     between = 0.5 * (time_s[gaps - 1] + time_s[gaps]) if gaps.size else time_s[:0]
     return np.insert(time_s, gaps, between), np.insert(values, gaps, np.nan)
 
 
-def _days(time_s: FloatArray) -> FloatArray:
+def _days(time_s: Floats) -> Floats:
     """Return times (n,) as Matplotlib counts them, in days."""
     moments = [datetime.fromtimestamp(one, UTC) for one in time_s.tolist()]
     return np.array([date2num(one) for one in moments])  # type: ignore[no-untyped-call]

@@ -13,11 +13,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from schemas.reasons import Reason
+from services.common.arrays import Floats
 from services.common.language import ENGLISH
 from services.viewer.crossing_view import (
     VEHICLE_COLOURS,
     CrossingView,
-    FloatArray,
     comparison_of,
     describe_crossing,
     summary_line,
@@ -58,7 +58,7 @@ def crossing_figure(
     *,
     crossing: CrossingView,
     element_truth: list[float] | None = None,
-    road_truth: tuple[FloatArray, FloatArray] | None = None,
+    road_truth: tuple[Floats, Floats] | None = None,
 ) -> None:
     """Draw one crossing into a PNG or SVG file; an existing file is replaced.
 
@@ -75,7 +75,7 @@ def draw_crossing(
     crossing: CrossingView,
     *,
     element_truth: list[float] | None,
-    road_truth: tuple[FloatArray, FloatArray] | None,
+    road_truth: tuple[Floats, Floats] | None,
 ) -> Figure:
     """Return the figure, to be drawn in `STYLE`."""
     has_road = crossing.road is not None or road_truth is not None
@@ -149,7 +149,7 @@ def _draw_rigidity(axes: Axes, crossing: CrossingView, truth: list[float] | None
     add_ratio_axis(axes, nominal)
 
 
-def _draw_estimate(axes: Axes, crossing: CrossingView, estimate: FloatArray) -> float:
+def _draw_estimate(axes: Axes, crossing: CrossingView, estimate: Floats) -> float:
     """Draw bars, intervals and labels in GN·m²; return the end of the vertical axis."""
     edges = crossing.element_edges_m
     doubtful = crossing.verdict != "good" or not crossing.interval_has_meaning
@@ -173,9 +173,7 @@ def _draw_estimate(axes: Axes, crossing: CrossingView, estimate: FloatArray) -> 
     return max(1.1 * float(upper.max()), top_above_labels(axes, lowest, upper, losses))
 
 
-def _draw_profiles(
-    axes: Axes, crossing: CrossingView, truth: tuple[FloatArray, FloatArray] | None
-) -> None:
+def _draw_profiles(axes: Axes, crossing: CrossingView, truth: tuple[Floats, Floats] | None) -> None:
     axes.set_title("Road profile")
     if crossing.road is not None or truth is not None:
         axes.set_ylabel("height (mm)")
@@ -209,7 +207,7 @@ def _profile_of(crossing: CrossingView, which: str) -> str:
 
 
 def _draw_differences(
-    axes: Axes, crossing: CrossingView, truth: tuple[FloatArray, FloatArray] | None
+    axes: Axes, crossing: CrossingView, truth: tuple[Floats, Floats] | None
 ) -> None:
     axes.set_title("Differences")
     road = crossing.road

@@ -11,17 +11,11 @@ import rerun as rr
 from schemas.alarms import Alarm
 from schemas.results import CrossingResult, lowest_element
 from schemas.site import Site
+from services.common.arrays import Floats, Ints
 from services.common.geodesy import BridgeFrame, bridge_frame
 from services.identification.comparison import Estimate
-from services.viewer.crossing_view import VEHICLE_COLOURS, CrossingView, ElementGeometry, FloatArray
-from services.viewer.rerun_parts import (
-    MUTED,
-    TIME,
-    IntArray,
-    log_labels,
-    log_line,
-    rgb,
-)
+from services.viewer.crossing_view import VEHICLE_COLOURS, CrossingView, ElementGeometry
+from services.viewer.rerun_parts import MUTED, TIME, log_labels, log_line, rgb
 from services.viewer.rerun_places import M_PER_DEGREE, BridgeOnMap, bridges_of_site
 from services.viewer.strip import STRIP_HEIGHT, STRIP_WIDTH
 
@@ -57,7 +51,7 @@ def of_site(site: Site | None) -> dict[str, SiteBridge]:
     }
 
 
-def bridges_near(names: Iterable[str], starts: FloatArray, places: FloatArray) -> list[str]:
+def bridges_near(names: Iterable[str], starts: Floats, places: Floats) -> list[str]:
     """Return the bridges, at `starts` (n, 2), near the last of the positions (m, 2)."""
     if not starts.size:
         return []
@@ -86,7 +80,7 @@ class TimestampedStream:
         self._recording.send_columns(entity_path, indexes, columns)
 
 
-def extremes(time_ns: IntArray, samples: FloatArray, rate_hz: float) -> tuple[IntArray, FloatArray]:
+def extremes(time_ns: Ints, samples: Floats, rate_hz: float) -> tuple[Ints, Floats]:
     """Return the smallest and largest sample of every `PERIOD_S` with their times, (≤ 2n/k,).
 
     A NaN, which breaks a line, stays.
@@ -148,7 +142,7 @@ def log_trend_style(recording: rr.RecordingStream, root: str, elements: int) -> 
 
 
 def log_trend(
-    recording: rr.RecordingStream, root: str, time_ns: int, fused: Estimate, nominal: FloatArray
+    recording: rr.RecordingStream, root: str, time_ns: int, fused: Estimate, nominal: Floats
 ) -> None:
     """Log EI of each element over nominal after a crossing, and the interval of the lowest."""
     stream = TimestampedStream(recording, time_ns)

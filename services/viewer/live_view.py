@@ -22,6 +22,7 @@ from schemas.results_on_the_wire import estimate_to_crossing, state_to_bridge
 from schemas.signals import AccelBatch, GnssFix, decode_accel, decode_gnss
 from schemas.site import Site
 from services.bus.realm_listener import BusMessage
+from services.common.arrays import Floats
 from services.common.geodesy import to_chainage
 from services.identification.comparison import (
     compare,
@@ -33,7 +34,6 @@ from services.viewer.crossing_scene import CrossingScene
 from services.viewer.crossing_view import (
     CrossingView,
     ElementGeometry,
-    FloatArray,
     comparison_of,
     describe_crossing,
     elements_of_result,
@@ -273,7 +273,7 @@ class LiveView:
                 where, span_m = np.column_stack((along, -left)), self._site[bridge].on_map.span_m
                 send_named_places(self._recording, entity, where, time_ns, span_m)
 
-    def _draw_result(self, view: CrossingView, rigidity_nm2: FloatArray, moment_ns: int) -> str:
+    def _draw_result(self, view: CrossingView, rigidity_nm2: Floats, moment_ns: int) -> str:
         """Draw EI along the span with the roads below it; return sentences on the result."""
         scene = CrossingScene(view, result_root(view.bridge), comparison_of(view))
         self._recording.set_time("time", timestamp=np.datetime64(moment_ns - 1000, "ns"))
@@ -295,7 +295,7 @@ class LiveView:
         TimestampedStream(self._recording, moment_ns).log(f"newest/{bridge}", document)
 
     def _draw_bridge(
-        self, bridge: BridgeOnMap, ratios: FloatArray | None, moment_ns: int, doubtful: bool
+        self, bridge: BridgeOnMap, ratios: Floats | None, moment_ns: int, doubtful: bool
     ) -> None:
         log_bridge(
             TimestampedStream(self._recording, moment_ns),

@@ -8,15 +8,14 @@ from typing import Any, Protocol
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
-from services.viewer.crossing_view import VEHICLE_COLOURS, FloatArray
+from services.common.arrays import Floats, Ints
+from services.viewer.crossing_view import VEHICLE_COLOURS
 from services.viewer.strip import STRIP_PAPER
 
 TIME, CHAINAGE = "time", "chainage_mm"
 """Names of the two timelines."""
 
-IntArray = NDArray[np.int64]
 Rgb = tuple[int, int, int]
 
 
@@ -72,7 +71,7 @@ def rgb(colour: str) -> Rgb:
     return red, green, blue
 
 
-def ratio_colours(ratios: FloatArray | None, count: int, *, doubtful: bool) -> list[Rgb]:
+def ratio_colours(ratios: Floats | None, count: int, *, doubtful: bool) -> list[Rgb]:
     """Return a colour for each of `count` elements by its relative EI (n,).
 
     It is grey where doubtful, and where a value is NaN: unresolved.
@@ -90,17 +89,17 @@ def ratio_colours(ratios: FloatArray | None, count: int, *, doubtful: bool) -> l
     return [(int(red), int(green), int(blue)) for red, green, blue in mixed]
 
 
-def time_column(time_ns: IntArray) -> rr.TimeColumn:
+def time_column(time_ns: Ints) -> rr.TimeColumn:
     """Return the index of wall time (n,), ns since 1970 UTC."""
     return rr.TimeColumn(TIME, timestamp=time_ns.astype("datetime64[ns]"))
 
 
-def chainage_column(chainage_m: FloatArray) -> rr.TimeColumn:
+def chainage_column(chainage_m: Floats) -> rr.TimeColumn:
     """Return the index of the front axle's chainage (n,), in whole mm as a timeline needs."""
     return rr.TimeColumn(CHAINAGE, sequence=np.rint(1e3 * chainage_m).astype(np.int64))
 
 
-def columns_of(time_ns: IntArray, chainage_m: FloatArray | None) -> list[rr.TimeColumn]:
+def columns_of(time_ns: Ints, chainage_m: Floats | None) -> list[rr.TimeColumn]:
     """Return both indexes (n,), or without a chainage that of time."""
     indexes = [time_column(time_ns)]
     if chainage_m is not None:
@@ -128,10 +127,10 @@ def log_line(
 def send_scalars(
     recording: RerunStream,
     entity: str,
-    values: FloatArray,
+    values: Floats,
     *,
-    time_ns: IntArray,
-    chainage_m: FloatArray | None = None,
+    time_ns: Ints,
+    chainage_m: Floats | None = None,
 ) -> None:
     """Log a time series (n,), if it has any samples."""
     if len(values):
@@ -139,7 +138,7 @@ def send_scalars(
         recording.send_columns(entity, indexes, rr.Scalars.columns(scalars=values))
 
 
-def log_round_beginning(recording: RerunStream, entity: str, chainage_m: FloatArray) -> None:
+def log_round_beginning(recording: RerunStream, entity: str, chainage_m: Floats) -> None:
     """Clear an entity at the last multiple of 10 m below a series' chainages (n,).
 
     Rerun counts the ticks of a plot from the first chainage with data: they were #50, #10 050 and
@@ -153,8 +152,8 @@ def log_labels(
     recording: RerunStream,
     entity: str,
     labels: Sequence[str],
-    across: FloatArray,
-    down: FloatArray,
+    across: Floats,
+    down: Floats,
     *,
     colour: str = LABEL,
 ) -> None:

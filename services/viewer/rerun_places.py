@@ -16,13 +16,13 @@ import rerun as rr
 
 from schemas.signals import GnssFix
 from schemas.site import Site
+from services.common.arrays import Floats, Ints
 from services.common.geodesy import bridge_frame, heading_deg, to_chainage
-from services.viewer.crossing_view import VEHICLE_COLOURS, FloatArray
+from services.viewer.crossing_view import VEHICLE_COLOURS
 from services.viewer.rerun_parts import (
     LABEL,
     MUTED,
     UNKNOWN,
-    IntArray,
     RerunStream,
     Rgb,
     columns_of,
@@ -117,7 +117,7 @@ def plan_root(identifier: str) -> str:
 def log_bridge(
     recording: RerunStream,
     bridge: BridgeOnMap,
-    ratios: FloatArray | None,
+    ratios: Floats | None,
     *,
     doubtful: bool,
     map_entity: str,
@@ -197,7 +197,7 @@ def log_surroundings(
             log_truck_on_plan(recording, f"{root}/truck/{vehicle}", places[near], time_ns)
 
 
-def log_track_on_plan(recording: RerunStream, entity: str, places_m: FloatArray) -> None:
+def log_track_on_plan(recording: RerunStream, entity: str, places_m: Floats) -> None:
     """Draw all positions of a truck (f, 2), in the plan's coordinates."""
     recording.log(
         entity,
@@ -214,9 +214,9 @@ def log_track_on_plan(recording: RerunStream, entity: str, places_m: FloatArray)
 def log_truck_on_plan(
     recording: RerunStream,
     entity: str,
-    places_m: FloatArray,
-    time_ns: IntArray,
-    chainage_m: FloatArray | None = None,
+    places_m: Floats,
+    time_ns: Ints,
+    chainage_m: Floats | None = None,
 ) -> None:
     """Draw the positions of the truck (f, 2) over time, in the plan's coordinates."""
     log_truck_style(recording, entity)
@@ -239,9 +239,9 @@ def log_truck_style(recording: RerunStream, entity: str, name: str | None = None
 def send_places(
     recording: RerunStream,
     entity: str,
-    places_m: FloatArray,
-    time_ns: IntArray,
-    chainage_m: FloatArray | None = None,
+    places_m: Floats,
+    time_ns: Ints,
+    chainage_m: Floats | None = None,
 ) -> None:
     """Log positions on a plan (f, 2) over time."""
     recording.send_columns(
@@ -250,7 +250,7 @@ def send_places(
 
 
 def send_named_places(
-    recording: RerunStream, entity: str, places_m: FloatArray, time_ns: IntArray, span_m: float
+    recording: RerunStream, entity: str, places_m: Floats, time_ns: Ints, span_m: float
 ) -> None:
     """Log positions of a truck on the plan of a bridge (f, 2), and of its name above them."""
     send_places(recording, entity, places_m, time_ns)
@@ -293,7 +293,7 @@ def log_drive_plan(
         return
     middle = np.concatenate(list(tracks.values())).mean(axis=0)
 
-    def on_plan(lat_lon: FloatArray) -> FloatArray:
+    def on_plan(lat_lon: Floats) -> Floats:
         return _east_north_m(lat_lon, middle) * (1.0, -1.0)
 
     for name, track in tracks.items():
@@ -341,11 +341,11 @@ def _log_on_map(
     )
 
 
-def _positions(fixes: Sequence[GnssFix]) -> FloatArray:
+def _positions(fixes: Sequence[GnssFix]) -> Floats:
     return np.array([(fix.latitude_deg, fix.longitude_deg) for fix in fixes])
 
 
-def _east_north_m(lat_lon: FloatArray, origin: FloatArray) -> FloatArray:
+def _east_north_m(lat_lon: Floats, origin: Floats) -> Floats:
     """Return metres (m, 2) to the east and to the north of the origin."""
     north, east = ((lat_lon - origin) * M_PER_DEGREE).T
     return np.column_stack((east * np.cos(np.radians(origin[0])), north))

@@ -19,6 +19,7 @@ from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.topics import Message
+from services.common.arrays import Floats
 from services.common.progress import Steps, no_step_progress
 from services.execution.blas import one_blas_thread
 from services.finding.crossing_data import CrossingData, wide_window
@@ -27,7 +28,7 @@ from services.finding.placed import first_axle, middle_of
 from services.identification.methods import METHODS
 from services.identification.pre_method import inputs_of
 from services.identification.result_parts import nominal_parameters
-from services.viewer.crossing_view import FloatArray, ResidualCells
+from services.viewer.crossing_view import ResidualCells
 
 BANDS_HZ = (0.0, 6.0, 12.0, 30.0, np.inf)
 """Bands that the verdict uses, Hz (docs/verdicts.md)."""
@@ -121,7 +122,7 @@ def _inputs(data: CrossingData) -> CrossingInputs | None:
 
 def _found(data: CrossingData, result: CrossingResult) -> FittedValues:
     parameters = result.parameters or {}
-    theta: FloatArray = nominal_parameters(data.vehicle, data.bridge)
+    theta: Floats = nominal_parameters(data.vehicle, data.bridge)
     for n, name in enumerate(names(data.bridge.elements, first_axle(data.vehicle))):
         if name in parameters:
             theta[n] = parameters[name].q50

@@ -19,8 +19,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from pre_core.arrays import FloatArray
 from services.common.files import write_atomically
-from services.viewer.crossing_view import VEHICLE_COLOURS, FloatArray
+from services.viewer.crossing_view import VEHICLE_COLOURS
 from services.viewer.drawing import DPI, GRID, INK, MUTED, STYLE, TRUTH_MARKER
 from studies.paper.scenarios import Scenario
 

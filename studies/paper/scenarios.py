@@ -23,12 +23,11 @@ from pre_core.physics.models import body_masses, from_models
 from pre_core.physics.vehicle import HalfCar
 from pre_core.search import loop
 from schemas.site_file import load_site
+from services.common.arrays import Floats
 from services.common.errors import FailureError, InputError
 from services.simulation.drive import beam_of, truck_of
 from services.simulation.validation_options import ScenarioOptions
 from studies.paper.tables import of_paper
-
-Floats = NDArray[np.float64]
 
 DERIVED = ("m_s1", "m_s2")
 

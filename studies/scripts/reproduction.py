@@ -13,7 +13,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -26,6 +25,7 @@ from pre_core.physics.bridge import natural_frequencies_hz
 from pre_core.physics.models import from_models
 from pre_core.physics.vehicle import natural_frequencies_hz as vehicle_frequencies_hz
 from pre_core.search import loop
+from services.common.arrays import Floats
 from services.simulation.drive import DrivenRoad, Measurement, paper_site, simulate_drive
 from studies.paper.scenarios import (
     NAMES,
@@ -36,7 +36,6 @@ from studies.paper.scenarios import (
 )
 from studies.paper.tables import tables_of_paper
 
-Floats = NDArray[np.float64]
 Proposal = Callable[[np.random.Generator, Floats], Floats]
 
 CONSOLE = Console(highlight=False, width=150)

@@ -13,15 +13,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from schemas.settings import IdentificationSettings
 from services.simulation.drawn import identify_simulated
 from services.simulation.wide_crossings import WideCase, drive_case, site_of
 from studies.simulation.tandem_cases import TandemOptions, draw_tandem
-
-Floats = NDArray[np.float64]
 
 _LOADED: Final = TandemOptions(total_mass_kg=(24.3e3, 25.3e3), span_m=(30.0, 30.0))
 """A loaded tipper on a bridge of 30 m."""

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.physics.bridge import Beam
 from pre_core.physics.road import Profile
@@ -18,6 +17,7 @@ from pre_core.physics.surface import Footprint
 from pre_core.physics.vehicle import HalfCar
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site
+from services.common.arrays import Floats
 from services.drives.runs import Run
 from services.simulation.drawn import (
     CrossingTruth,
@@ -38,8 +38,6 @@ from services.simulation.two_sided_deck import Deck, Torsion
 from services.simulation.two_sided_surface import draw_waves
 from services.simulation.wheel_paths import WheelPaths
 from services.simulation.wide_crossings import WideSensor, road_under, sensor_row
-
-Floats = NDArray[np.float64]
 
 LONGEST_STEP_S = 2e-4
 """Longest sampling interval of the accelerometers' filters."""

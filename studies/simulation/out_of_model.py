@@ -34,12 +34,12 @@ The ranges, uniform unless stated:
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.physics.bridge import Beam, natural_frequencies_hz
 from pre_core.physics.vehicle import HalfCar
 from schemas.site import Bridge, Site
+from services.common.arrays import Floats
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.simulation.drawn import CrossingTruth, SimulatedCrossing, draw_truth, drive
 from services.simulation.drive import DepartedVehicle, OutOfModelEffects, with_effects
@@ -57,8 +57,6 @@ from services.simulation.two_sided_deck import Torsion
 from services.simulation.wheel_paths import WANDER_M, SurfaceOptions, WheelPaths, wheel_paths_of
 from services.simulation.wide_crossings import WideSensor
 from studies.simulation.drive_wide import Width, drive_wide
-
-Floats = NDArray[np.float64]
 
 SPRUNG_EI_PER_SPAN = (0.1, 3.0)
 BEARINGS_N_PER_M = (1e9, 2e10)

@@ -34,12 +34,11 @@ from pre_core.survey.plan import (
     survey_information,
     survey_spreads,
 )
+from services.common.arrays import Floats
 from services.simulation.data_alone import inputs_of_seen
 from services.simulation.drawn import CrossingTruth, IdentifiedCrossing, SimulatedCrossing
 from studies.simulation.truths import true_values
 from studies.validation.calibration_statistics import truncated_covariance
-
-Floats = NDArray[np.float64]
 
 DIFFERENCE = 1e-4
 """Step of a central difference in the posterior's coordinates: multiples of a prior's spread, and

@@ -10,7 +10,6 @@ from multiprocessing import get_context
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pre_core import parameters
 from pre_core.constants import NORMAL_975
@@ -18,6 +17,7 @@ from pre_core.physics.road import Profile
 from schemas.results import CrossingResult, Parameter
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
+from services.common.arrays import Floats
 from services.common.child_process import end_with_parent
 from services.identification.result_parts import detrended
 from services.simulation.drawn import (
@@ -32,7 +32,6 @@ from studies.validation import calibration_statistics as statistics
 from studies.validation.bound import bound_at_truth
 from studies.validation.calibration_statistics import Scores
 
-Floats = NDArray[np.float64]
 Record = dict[str, Any]
 """One crossing as JSON, see `record`."""
 

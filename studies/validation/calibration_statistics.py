@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, log_ndtr, ndtr
 
+from pre_core.arrays import FloatArray
 from pre_core.constants import NORMAL_975
-
-FloatArray = NDArray[np.float64]
 
 
 class Scores(NamedTuple):

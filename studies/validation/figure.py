@@ -14,8 +14,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MultipleLocator, PercentFormatter
 
+from pre_core.arrays import FloatArray
 from services.common.files import write_atomically
-from services.viewer.crossing_view import VEHICLE_COLOURS, FloatArray
+from services.viewer.crossing_view import VEHICLE_COLOURS
 from services.viewer.drawing import DPI, GRID, INK, MUTED, STYLE
 from studies.validation.calibration_statistics import Scores
 

@@ -20,6 +20,7 @@ from pre_core.physics.bridge import Beam
 from schemas.results import BridgeResult, CrossingResult
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Site, Vehicle
+from services.common.arrays import Floats
 from services.common.progress import Steps, no_step_progress
 from services.drives.runs import Run
 from services.finding.placed import middle_site
@@ -34,8 +35,6 @@ from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
 from studies.simulation.out_of_model import draw_out_of_model
 from studies.validation.calibration import Aim, Record
 from studies.validation.worlds import completed, identity_of, read_records
-
-Floats = NDArray[np.float64]
 
 SPEED_M_PER_S, _FASTER = 10.0, 0.15
 _RATE_HZ = 500.0

@@ -22,17 +22,15 @@ from multiprocessing import get_context
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import beta
 
+from pre_core.arrays import FloatArray
 from pre_core.monitoring.baseline import Period
 from pre_core.monitoring.change_detection import AlarmRules, Change, detect_change
 from pre_core.monitoring.observation import Observation, combine_observations
 from services.execution.blas import one_blas_thread
 from services.identification.observed import observation_of
 from tests.fleet import bridge_of, crossing_of, season_deg_c, templates, trucks_of
-
-FloatArray = NDArray[np.float64]
 
 WEEK_S = 7.0 * 86_400.0
 CHANGE = 0.005

@@ -8,14 +8,12 @@ from start to end, a wheelbase that is a whole number of samples, free supports,
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.signal import lfilter
 
 from pre_core.paper.window import PaperWindow
 from pre_core.parameters import ALPHA, BETA, C_S1, D_1, EI_1, K_S1, K_U1, M_U1, RHO_A
-
-Floats = NDArray[np.float64]
+from services.common.arrays import Floats
 
 
 class Prepared(NamedTuple):

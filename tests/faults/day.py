@@ -34,7 +34,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from pre_core.paper.experiment import scenario_ratios
@@ -42,6 +41,7 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site
 from schemas.site_file import site_toml
+from services.common.arrays import Floats
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.recordings.recording import read_info, read_messages
@@ -55,7 +55,6 @@ from tests.endpoints import free_endpoint, free_port
 from tests.parent import parent_environment
 from tests.waiting import LONGEST_S
 
-Floats = NDArray[np.float64]
 REALM = "sim-day"
 SPEED_M_PER_S = 10.0
 APART_M = 200.0

@@ -7,8 +7,8 @@ better than the sensors.
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing.arguments import EvaluationPoints, GriddedCrossing, allocate_buffers
 from pre_core.crossing.channels import channel_signals
@@ -40,8 +40,6 @@ from tests.numerics.whitened import white_rows
 
 if TYPE_CHECKING:
     from services.simulation.drive import SimulatedDrive
-
-FloatArray = NDArray[np.float64]
 
 NOISE_UG = 5.0
 BEFORE_S = 3.0  # of driving in a simulated recording before the front axle enters

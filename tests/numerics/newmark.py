@@ -7,11 +7,9 @@ agree to rounding, so that the modal one may be used where speed matters.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.kernels.lanes import compiled
-
-FloatArray = NDArray[np.float64]
 
 
 class Response(NamedTuple):

@@ -1,11 +1,9 @@
 """Deflections of a bridge under static loads."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.physics.bridge import Beam, interpolation_matrix, stiffness_matrix
-
-FloatArray = NDArray[np.float64]
 
 
 def static_deflection_m(

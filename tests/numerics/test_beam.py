@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from pre_core.arrays import FloatArray
 from pre_core.paper import experiment
 from pre_core.physics.bridge import (
     element_mass,
@@ -36,7 +36,6 @@ from pre_core.physics.vehicle import static_axle_loads_n
 from pre_core.search.levenberg_marquardt import sixth_order_jacobian
 from tests.numerics.statics import static_deflection_m
 
-FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]
 
 SPAN, EI, RHO = 30.0, 1.56e10, 4400.0

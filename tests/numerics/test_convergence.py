@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.search import convergence
-
-FloatArray = NDArray[np.float64]
 
 
 def autoregressive(phi: float, n: int, chains: int, seed: int = 0) -> FloatArray:

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.paper import experiment
 from pre_core.paper.integrate import newmark_integrate
 from pre_core.physics.bridge import (
@@ -29,7 +29,6 @@ from pre_core.physics.simulate import (
 )
 from pre_core.physics.vehicle import HalfCar, static_axle_loads_n
 
-FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]
 
 FULL_CAR = experiment.TRUCK._replace(

@@ -5,12 +5,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import posterior
 from pre_core.crossing.fit import normal_approximation
 from pre_core.fusion.curvature import CurvatureTerms, curvature_terms, linearise_with_curvature
 from tests.numerics.single_tyres import at_its_truth
 
-FloatArray = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 BRIDGE, OTHERS, ROWS = 3, 2, 12

@@ -2,13 +2,10 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pre_core.fusion.path_groups import FusionInput
 from pre_core.fusion.vehicle_consistency import VehicleConsistency, find_misattributed
 from tests.numerics.test_fusion import PRIORS, crossing_of, root
-
-FloatArray = NDArray[np.float64]
 
 SURE = 1e-3
 """Precision of the truck's unknown in a crossing, in standard deviations of its prior."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 from scipy.interpolate import BSpline
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import mismatch as mm
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.posterior import layout, log_odds_of_absence
@@ -50,8 +51,6 @@ from services.drives.csv_import import read_folder
 from services.drives.runs import normalised
 from services.identification import pre_method
 from services.simulation.drawn import identify_simulated
-
-FloatArray = NDArray[np.float64]
 
 FRONT, REAR = TYPICAL_FOOTPRINTS
 

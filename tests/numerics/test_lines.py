@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import signal
 
 from pre_core.crossing import lines
+from services.common.arrays import Floats
 
-Floats = NDArray[np.float64]
 APART_S = 0.009
 COUNT = 900
 

@@ -5,6 +5,7 @@ from collections import defaultdict
 import numpy as np
 
 from pre_core import parameters
+from pre_core.arrays import FloatArray
 from pre_core.paper import experiment
 from pre_core.physics.models import beam_from, from_models
 from pre_core.physics.road import Profile, under_wheels
@@ -21,7 +22,7 @@ BEAM = experiment.beam(experiment.scenario_ratios(6))._replace(
 )
 
 
-def car_from(theta: parameters.FloatArray, total_kg: float) -> HalfCar:
+def car_from(theta: FloatArray, total_kg: float) -> HalfCar:
     fields = defaultdict(list)
     for row, value in zip(parameters.table(BEAM.flexural_rigidity_nm2.size), theta, strict=True):
         if row.part == parameters.TRUCK and row.name != "share":  # of a tandem
@@ -42,7 +43,7 @@ def test_accelerations_stay_where_everything_follows_its_power_of_the_mass() -> 
     road = Profile(x, 0.004 * np.sin(2.0 * np.pi * x / 7.3) ** 2)
     motion = constant_speed(-5.0, experiment.SPEED_M_PER_S, 700, STEP_S)
 
-    def accelerations(of: parameters.FloatArray, mass_kg: float) -> parameters.FloatArray:
+    def accelerations(of: FloatArray, mass_kg: float) -> FloatArray:
         car = car_from(of, mass_kg)
         beam = beam_from(
             of,

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.constants import SLOPE_SPREAD
 from pre_core.monitoring.baseline import (
     BaselineState,
@@ -32,7 +32,6 @@ from pre_core.monitoring.observation import Observation, SharedError, combine_ob
 from services.identification.observed import observation_of
 from tests.fleet import bridge_of, crossing_of, templates, trucks_of
 
-FloatArray = NDArray[np.float64]
 N = 5
 WEEKS = 60
 ONE = Scales(np.zeros(1), np.zeros(1), np.ones(1), np.zeros(1))

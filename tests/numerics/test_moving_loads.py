@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from pre_core.arrays import FloatArray
 from pre_core.physics.bridge import (
     Beam,
     interpolation_matrix,
@@ -29,7 +29,6 @@ from pre_core.physics.simulate import (
 from pre_core.physics.vehicle import HalfCar
 from tests.numerics.newmark import newmark_modal
 
-FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]
 
 FAR_M = 1000.0  # wheelbase of the trucks below: their rear axle never comes near the bridge

@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
+from pre_core.arrays import FloatArray
 from pre_core.paper import experiment
 from pre_core.paper.integrate import newmark_integrate, spline_integrate
 from pre_core.physics.bridge import interpolation_matrix, mass_matrix, modes, stiffness_matrix
 from tests.numerics.newmark import newmark, newmark_modal
 
-FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]
 
 

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh, lu_factor, lu_solve
 from scipy.optimize import brentq
 
+from pre_core.arrays import FloatArray
 from pre_core.kernels.jacobi import diagonalise, diagonalise_one
 from pre_core.paper import experiment
 from pre_core.paper.integrate import newmark_integrate, spline_integrate
@@ -55,8 +55,6 @@ from pre_core.physics.simulate import (
     simulate,
 )
 from pre_core.physics.vehicle import HalfCar, total_mass_kg
-
-FloatArray = NDArray[np.float64]
 
 STEP_S = 0.001
 LENGTHS = np.full(7, 30.0 / 7)

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.arguments import EvaluationPoints, GriddedCrossing, allocate_buffers
 from pre_core.crossing.channels import A, channel_signals
 from pre_core.crossing.deflection import SWING_MODES
@@ -37,8 +37,6 @@ from tests.numerics.crossings import (
     simulated,
     uncorrected,
 )
-
-FloatArray = NDArray[np.float64]
 
 TRUCK = experiment.TRUCK
 BEAM = experiment.beam(experiment.scenario_ratios(6))

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import channels
 from pre_core.crossing.channels import (
     A_1,
@@ -23,8 +23,6 @@ from pre_core.crossing.channels import (
     low_pass,
 )
 from pre_core.physics.sensors import resample
-
-FloatArray = NDArray[np.float64]
 
 ORDERS = {Z: -2, V: -1, A: 0, A_1: 1, A_2: 2, A_3: 3}
 """How often each signal is the acceleration differentiated."""

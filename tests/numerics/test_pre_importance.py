@@ -4,14 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import dblquad, quad
 from scipy.stats import multivariate_normal
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import sampling, surrogate
 from pre_core.search import importance
 
-FloatArray = NDArray[np.float64]
 COUNT = 4000
 SPARE = surrogate._NUISANCES
 """Coordinates that are not watched: as many as their principal directions that are."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import mismatch as mm
 from pre_core.crossing.channels import GainsAndDelays
 from pre_core.crossing.compliances import CompliancePosterior, draws
@@ -35,8 +36,6 @@ from pre_core.physics.surface import (
 from services.simulation.drive import beam_of, paper_site
 from services.simulation.drive import truck_of as car_of
 from tests.numerics.whitened import white_rows
-
-FloatArray = NDArray[np.float64]
 
 STEP_S = 3e-3
 SPEED = 10.0

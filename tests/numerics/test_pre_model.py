@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing.arguments import EvaluationPoints, GriddedCrossing, allocate_buffers
 from pre_core.crossing.channels import A, V, Z
@@ -35,8 +35,6 @@ from tests.numerics.crossings import (
 
 if TYPE_CHECKING:
     from services.simulation.drive import SimulatedDrive
-
-FloatArray = NDArray[np.float64]
 
 START, END = K_ROT, K_ROT + 1
 

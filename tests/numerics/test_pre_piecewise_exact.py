@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from pre_core.arrays import FloatArray
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing.arguments import allocate_buffers
 from pre_core.crossing.residuals import roads_and_deflections
@@ -20,8 +20,6 @@ from pre_core.parameters import ALPHA, C_S1, D_1, EI_1, K_S1, K_U1, KAPPA, M_U1,
 from pre_core.physics import modal_response as piecewise_exact
 from pre_core.physics.beam_basis import beam_basis
 from tests.numerics.crossings import bare_crossing, uncorrected
-
-FloatArray = NDArray[np.float64]
 
 STEP_S = 3e-3
 

@@ -4,9 +4,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
+from pre_core.arrays import FloatArray
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing import channels
 from pre_core.crossing.channels import channel_signals
@@ -40,8 +40,6 @@ from services.simulation.drive import beam_of, paper_site, truck_of
 
 if TYPE_CHECKING:
     from services.simulation.drive import SimulatedDrive
-
-FloatArray = NDArray[np.float64]
 
 POSITION_NOISE_M, SPEED_NOISE_M_PER_S, OFFSET_SPREAD_M = 0.02, 0.03, 1.2
 SPRING_SPREAD = 4e8

@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 import scipy.signal
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.channels import PASS_BAND, STOP
 from pre_core.crossing.residuals import _read
 from pre_core.crossing.step_tables import sinc_table
 from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
-
-FloatArray = NDArray[np.float64]
 
 TABLE = sinc_table()
 PHASES, TAPS = TABLE.shape[0] - 1, TABLE.shape[2]

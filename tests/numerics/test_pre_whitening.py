@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.linalg import cholesky_banded, solve_banded
 
+from pre_core.arrays import FloatArray
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing.channels import A_1, A_2, A, V, Z, channel_signals
 from pre_core.crossing.noise import (
@@ -36,8 +36,6 @@ from pre_core.physics.sensors import white_noise
 from pre_core.physics.vehicle import HalfCar, body_masses_kg
 from services.simulation.drive import beam_of, paper_site, truck_of
 from tests.numerics.whitened import white_rows
-
-FloatArray = NDArray[np.float64]
 
 DENSITY_UG = np.array([25.0, 40.0, 60.0, 30.0])
 """Four different ones: swapped channels would show."""

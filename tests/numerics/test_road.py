@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.signal import periodogram, welch
 
+from pre_core.arrays import FloatArray
 from pre_core.physics import road
 from pre_core.physics.road import (
     GEOMETRIC_MEAN_M3,
@@ -26,7 +26,6 @@ from pre_core.physics.road import (
 )
 from pre_core.physics.simulate import constant_speed
 
-FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.signal import csd, welch
 
+from pre_core.arrays import FloatArray
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.physics.sensors import (
     Accelerometer,
@@ -16,8 +16,6 @@ from pre_core.physics.sensors import (
     measure_position,
     quantisation_m_per_s2,
 )
-
-FloatArray = NDArray[np.float64]
 
 
 def noise(sensor: Accelerometer, seconds: float, seed: int = 1) -> FloatArray:

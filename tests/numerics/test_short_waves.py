@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing import posterior
 from pre_core.crossing.compliances import to_compliance_coordinates
 from pre_core.crossing.rows import filter_adjoint, filter_rows, row_count, row_filter
@@ -18,7 +18,6 @@ from pre_core.physics.simulate import rear_position_m
 from tests.numerics.single_tyres import at_its_truth
 from tests.numerics.whitened import white_rows
 
-FloatArray = NDArray[np.float64]
 ELEMENTS = 5
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import quad
 
+from pre_core.arrays import FloatArray
 from pre_core.paper import experiment
 from pre_core.physics.simulate import (
     CoupledResponse,
@@ -19,8 +19,6 @@ from pre_core.physics.vehicle import (
     dahl_friction_n,
     static_axle_loads_n,
 )
-
-FloatArray = NDArray[np.float64]
 
 LEVEL_N = (3000.0, 4500.0)
 LENGTH_M = 0.002

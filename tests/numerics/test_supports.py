@@ -5,9 +5,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from pre_core.arrays import FloatArray
 from pre_core.physics.bridge import (
     Beam,
     interpolation_matrix,
@@ -20,7 +20,6 @@ from pre_core.physics.bridge import (
 )
 from tests.numerics.statics import static_deflection_m
 
-FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]
 
 EI, RHO = 1.56e10, 4400.0

@@ -4,9 +4,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import csd
 
+from pre_core.arrays import FloatArray
 from pre_core.physics.road import Profile, under_axles, under_wheels
 from pre_core.physics.simulate import constant_speed
 from pre_core.physics.surface import (
@@ -16,8 +16,6 @@ from pre_core.physics.surface import (
     spectra,
     surface_density,
 )
-
-FloatArray = NDArray[np.float64]
 
 SINGLE = Footprint()
 TWIN = Footprint(width_m=0.22, twin_distance_m=0.33, offset_m=0.005)

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from pre_core.arrays import FloatArray
 from pre_core.paper import experiment
 from pre_core.physics.bridge import (
     Beam,
@@ -24,8 +24,6 @@ from pre_core.physics.simulate import (
 )
 from tests.numerics.newmark import newmark_modal
 from tests.numerics.statics import static_deflection_m
-
-FloatArray = NDArray[np.float64]
 
 
 def unequal_beam() -> Beam:

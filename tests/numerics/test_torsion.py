@@ -11,13 +11,14 @@ import itertools
 import numpy as np
 import pytest
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.arguments import GriddedCrossing, allocate_buffers
 from pre_core.crossing.residuals import roads_and_deflections
 from pre_core.crossing.rows import row_filter
 from pre_core.paper import experiment
 from pre_core.parameters import TORSION
 from pre_core.physics.beam_basis import beam_basis
-from pre_core.physics.bridge import Beam, FloatArray, refine, uniform_beam
+from pre_core.physics.bridge import Beam, refine, uniform_beam
 from pre_core.physics.models import from_models
 from pre_core.physics.road import Profile, under_wheels
 from pre_core.physics.simulate import Discretisation, constant_speed, simulate

@@ -15,6 +15,7 @@ from pre_core.physics.bridge import refine, uniform_beam
 from pre_core.physics.simulate import Discretisation
 from pre_core.physics.surface import Footprint, spectra, surface_density
 from pre_core.physics.vehicle import HalfCar, dahl_friction_n
+from services.common.arrays import Floats
 from services.simulation.two_sided import (
     LONGEST_STEP_S,
     Body,
@@ -38,8 +39,6 @@ from services.simulation.two_sided_surface import (
     draw_waves,
     heights_m,
 )
-
-Floats = NDArray[np.float64]
 
 GRAVITY = 9.80665
 LORRY = WideTruck(

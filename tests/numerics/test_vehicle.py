@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from pre_core.arrays import FloatArray
 from pre_core.paper import experiment
 from pre_core.physics.simulate import (
     Discretisation,
@@ -27,7 +27,6 @@ from pre_core.physics.vehicle import (
     total_mass_kg,
 )
 
-FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]
 
 

@@ -1,12 +1,10 @@
 """Whitened residuals, many at once."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.rows import RESIDUALS, RowFilter, row_count
 from pre_core.crossing.whitening import Whitener, whiten_into
-
-FloatArray = NDArray[np.float64]
 
 
 def white_rows(rows: RowFilter, noise: Whitener, residuals: FloatArray) -> FloatArray:

@@ -28,13 +28,13 @@ from schemas.signals import CHANNELS, AccelChannel, decode_accel, encode_accel
 from schemas.site import Bridge, Site, Vehicle
 from schemas.site_file import site_hash
 from schemas.topics import Message
+from services.common.arrays import Floats
 from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.identification.engine import Engine
 from services.simulation.drive import START_TIME_S, beam_of, declared_site, paper_site, truck_of
 from tests.working_engine import feed_all, unhurried
 
-Floats = NDArray[np.float64]
 Channels = dict[str, Floats]
 
 _PARTS, _MODES = 10, 40

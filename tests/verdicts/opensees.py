@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from schemas.site import Site
-
-Floats = NDArray[np.float64]
+from services.common.arrays import Floats
 
 STEP_S, EVERY = 0.5e-3, 2
 """Time step, and its multiple at which the sensors are read (1 kHz)."""

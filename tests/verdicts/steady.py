@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from services.common.arrays import Floats
 from services.finding.crossing_data import CrossingData
 from services.finding.stays import Passage, Stay
 from services.finding.streams import Fixes
-from services.identification.result_parts import Floats
 from services.simulation.drive import paper_site
 
 ENTRY_S, EXIT_S = 3.0, 6.44

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from schemas.signals import CHANNELS
-from tests.verdicts.faults import Channels, Fault, Floats, Truth, crossing, identified, z_scores
+from services.common.arrays import Floats
+from tests.verdicts.faults import Channels, Fault, Truth, crossing, identified, z_scores
 
 
 def humming(hz: float, amplitude_m_per_s2: float, which: tuple[str, ...] = CHANNELS) -> Fault:

@@ -8,6 +8,7 @@ from scipy.fft import dct
 
 from pre_core.diagnostics import quality
 from schemas.reasons import Reason
+from services.common.arrays import Floats
 from services.finding.crossing_data import CrossingData
 from services.identification.checks import (
     BODY_FRONT,
@@ -16,7 +17,6 @@ from services.identification.checks import (
     reasons_after_fit,
     stiffer_elements,
 )
-from services.identification.result_parts import Floats
 from tests.verdicts.steady import steady_crossing
 
 STEP_S = 0.005

@@ -16,6 +16,7 @@ from pre_core.diagnostics.converter import converter_step
 from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason, texts
 from schemas.signals import CHANNELS
+from services.common.arrays import Floats
 from services.identification.signal_checks import reasons_before_fit
 from tests.verdicts import faults
 from tests.verdicts.faults import Case, Fault, Truth
@@ -55,12 +56,12 @@ def accused(seed: int | None, fault: Fault = faults.NOTHING) -> dict[Reason, str
     )
 
 
-def axles_swapped(channels: dict[str, faults.Floats], _: faults.Floats) -> faults.Channels:
+def axles_swapped(channels: dict[str, Floats], _: Floats) -> faults.Channels:
     """The truck's front is called its rear."""
     return {S1: channels[S2], S2: channels[S1], U1: channels[U2], U2: channels[U1]}
 
 
-def front_inverted(channels: dict[str, faults.Floats], _: faults.Floats) -> faults.Channels:
+def front_inverted(channels: dict[str, Floats], _: Floats) -> faults.Channels:
     """Both sensors of one axle: its body equation still holds."""
     return channels | {S1: -channels[S1], U1: -channels[U1]}
 
@@ -139,7 +140,7 @@ def test_quantised_channel_is_not_saturated(seed: int | None, step_m_per_s2: flo
 
 @pytest.mark.parametrize("name", [U1, U2])
 def test_quantised_channel_that_is_saturated_is_named(name: str) -> None:
-    def both(channels: faults.Channels, time_s: faults.Floats) -> faults.Channels:
+    def both(channels: faults.Channels, time_s: Floats) -> faults.Channels:
         return faults.quantised(faults.saturated(name).channels(channels, time_s), 9.6e-3)
 
     assert accused(None, Fault(channels=both)) == {Reason.SENSOR_SATURATED: name}
@@ -158,7 +159,7 @@ def test_a_coarse_converter_is_not_broken(range_g: float) -> None:
     """12 bits: the body's channels hold one value for up to 30 samples."""
     step = 2.0 * range_g * 9.80665 / 2.0**12
 
-    def coarse(channels: faults.Channels, _: faults.Floats) -> faults.Channels:
+    def coarse(channels: faults.Channels, _: Floats) -> faults.Channels:
         return {name: step * np.round(values / step) for name, values in channels.items()}
 
     _, case = sound(None)
@@ -176,7 +177,7 @@ def test_noise_alone_has_no_order() -> None:
 def test_a_pothole_is_no_spike() -> None:
     """A short, hard impact is felt by an axle for milliseconds, not for one sample."""
 
-    def impact(channels: faults.Channels, time_s: faults.Floats) -> faults.Channels:
+    def impact(channels: faults.Channels, time_s: Floats) -> faults.Channels:
         ringing = np.exp(-time_s / 0.05) * np.sin(2.0 * np.pi * 13.0 * time_s)
         return channels | {U1: channels[U1] + 60.0 * np.where(time_s > 0.0, ringing, 0.0)}
 

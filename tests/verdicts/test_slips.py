@@ -13,6 +13,7 @@ from pre_core.crossing import slip
 from pre_core.crossing.channels import A_1, A, V, Z
 from schemas.reasons import Reason
 from schemas.signals import CHANNELS
+from services.common.arrays import Floats
 from services.identification import checks, fit_reasons
 from services.identification.checks import Fit
 from tests.verdicts import faults
@@ -123,7 +124,7 @@ def test_unit_step_is_what_a_late_channel_adds() -> None:
     time_s = np.linspace(0.0, 0.999, 1000, dtype=np.float64)
     w = 2.0 * np.pi * 3.0
 
-    def sine(at_s: faults.Floats) -> faults.Floats:
+    def sine(at_s: Floats) -> Floats:
         orders = [-np.sin(w * at_s) / w**2, -np.cos(w * at_s) / w, np.sin(w * at_s)]
         orders += [w * np.cos(w * at_s), -(w**2) * np.sin(w * at_s), -(w**3) * np.cos(w * at_s)]
         return np.asarray(np.stack(orders), dtype=np.float64)

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.signals import CHANNELS, MAX_ACCELERATION_M_PER_S2
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.drives.tables import judged
 from services.drives.tables.findings import Findings, Target
@@ -13,8 +13,6 @@ from services.drives.tables.judged import Gravity
 from services.drives.tables.mapping import ColumnMap
 from services.drives.tables.parts import TablePart
 from services.drives.tables.units import ACCELERATION, G, unit_of
-
-Floats = NDArray[np.float64]
 
 
 def scaled(

@@ -5,14 +5,12 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.drives.tables.columns import ColumnChoice, column_number
 from services.drives.tables.dialect import Sheet, is_number
 from services.drives.tables.mapping import ColumnMap, FileMap
-
-Floats = NDArray[np.float64]
 
 SIDES: Final = {"latitude_deg": {"N": 1.0, "S": -1.0}, "longitude_deg": {"E": 1.0, "W": -1.0}}
 """Letters of hemispheres with their signs."""

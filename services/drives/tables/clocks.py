@@ -6,15 +6,13 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.common.language import utc_day
 from services.drives.tables.findings import Findings, Target
 from services.drives.tables.parts import TablePart
 from services.drives.tables.stamps import start_of, to_utc, zone_of
-
-Floats = NDArray[np.float64]
 
 _MAX_QUARTERS: Final = 4 * 14
 """Largest difference between UTC and a country's clocks, in quarters of an hour."""

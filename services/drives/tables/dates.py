@@ -6,12 +6,9 @@ from datetime import UTC, datetime, tzinfo
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.drives.tables.mapping import Order
 from services.drives.tables.stamps import Times, offset_of, to_utc
-
-Floats = NDArray[np.float64]
 
 _ZONES: Final = {"CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2, "WEST": 1, "EET": 2, "EEST": 3}
 """Names of zones of one meaning, in hours east; others are refused."""

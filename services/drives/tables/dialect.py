@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.common.files import read_bytes
 from services.drives.tables.mapping import FileMap
-
-Floats = NDArray[np.float64]
 
 _DELIMITERS: Final = (";", "\t", ",", "|", " ")
 _NAMES: Final = {"\t": "tab", " ": "space"}

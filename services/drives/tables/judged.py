@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from pre_core.diagnostics.noise_floor import NoiseSegment, density
 from schemas.site import Bridge, Site, Vehicle
 from schemas.wgs84 import SEMI_MAJOR_AXIS_M
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.common.geodesy import on_plane_m
 from services.drives.tables.units import ACCELERATION, SPEED, G
 from services.finding.placed import densities_ug_per_rthz
-
-Floats = NDArray[np.float64]
 
 NEAR_M: Final = 100_000.0
 _GRAVITY_TOLERANCE: Final = 0.03

@@ -5,8 +5,8 @@ from datetime import tzinfo
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.drives.tables.angles import SIDES, angles, sides_of
 from services.drives.tables.columns import DATE, TIME, WEEK, ColumnChoice, placed_columns, words_of
@@ -32,8 +32,6 @@ from services.drives.tables.stamps import (
     numeric_times,
 )
 from services.drives.tables.units import is_raw, unit_of
-
-Floats = NDArray[np.float64]
 
 _SECONDS_OF_WEEK: Final = {"tow", "itow", "sow", "gpstow", "gpssow"}
 _LONGEST_UPTIME_S: Final = 1e8

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.drives.runs import GnssTrack
 from services.drives.tables import judged
@@ -13,8 +13,6 @@ from services.drives.tables.findings import Findings, Target
 from services.drives.tables.mapping import ColumnMap
 from services.drives.tables.parts import TablePart
 from services.drives.tables.units import LENGTH, SPEED, unit_of
-
-Floats = NDArray[np.float64]
 
 _SPEED_TOLERANCE: Final = 0.25
 """Tolerance of the ratio of speeds to those of the positions, along a straight drive."""

@@ -6,13 +6,11 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from services.common.arrays import Floats
 from services.common.naming import count_of
 from services.drives.runs import Run, grid_index
 from services.drives.tables.reading import Understood
-
-Floats = NDArray[np.float64]
 
 _ROWS: Final = 3
 _BARS: Final = "▁▂▃▄▅▆▇█"

@@ -4,16 +4,14 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.drives.tables.findings import Findings, Target
 from services.drives.tables.judged import sentinels
 from services.drives.tables.mapping import POSITION_COLUMNS
 from services.drives.tables.parts import TablePart
 from services.drives.tables.stamps import kept_rows
-
-Floats = NDArray[np.float64]
 
 _NO_FIX: Final = (91.0, 181.0, 99.0, 999.0, 9999.0, 99999.0, 99.9999, 999.9999)
 """Latitudes and longitudes that receivers write without a fix."""

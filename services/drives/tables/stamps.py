@@ -12,10 +12,9 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 import numpy as np
 from numpy.typing import NDArray
 
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.drives.tables.mapping import Order, TimeFormat
-
-Floats = NDArray[np.float64]
 
 _UNIX: Final[dict[TimeFormat, float]] = {
     "unix_s": 1.0, "unix_ms": 1e-3, "unix_us": 1e-6, "unix_ns": 1e-9,

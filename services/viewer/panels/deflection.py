@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.physics.bridge import Beam, interpolation_matrix, refine, stiffness_matrix
+from services.common.arrays import Floats
 from services.viewer.crossing_scene import CrossingScene, Panel
-from services.viewer.crossing_view import BESIDE_S, CrossingView, FloatArray
+from services.viewer.crossing_view import BESIDE_S, CrossingView
 from services.viewer.rerun_parts import (
     MUTED,
     RerunStream,
@@ -39,11 +40,11 @@ _BENT_SHARE = 0.06
 class DeflectionFrames(NamedTuple):
     """The deflected bridge at f positions of the truck, drawn with k + 1 points."""
 
-    front_m: FloatArray  # (f,) chainage of the front axle
-    rear_m: FloatArray  # (f,)
-    x_m: FloatArray  # (k + 1,) along the bridge
-    deflection_m: FloatArray  # (f, k + 1), up positive
-    under_axles_m: FloatArray  # (f, 2), zero off the bridge
+    front_m: Floats  # (f,) chainage of the front axle
+    rear_m: Floats  # (f,)
+    x_m: Floats  # (k + 1,) along the bridge
+    deflection_m: Floats  # (f, k + 1), up positive
+    under_axles_m: Floats  # (f, 2), zero off the bridge
     element: NDArray[np.int64]  # (k,) number of the element, from 0, that each piece belongs to
 
     @property
@@ -164,12 +165,12 @@ def _log(recording: RerunStream, scene: CrossingScene, passage: DeflectionFrames
     recording.send_columns(f"{entity}/truck", columns, rr.LineStrips2D.columns(strips=body))
 
 
-def _body(front: FloatArray, rear: FloatArray, wheel: float) -> FloatArray:
+def _body(front: Floats, rear: Floats, wheel: float) -> Floats:
     """Return the outline of a two-axle truck, closed, with the cab over the front axle."""
     along = front - rear
     up = np.array([0.0, -wheel])
 
-    def at(share: float, high: float) -> FloatArray:
+    def at(share: float, high: float) -> Floats:
         return np.asarray(rear + share * along + high * up)
 
     outline = (-0.25, 1.5), (-0.25, 4.0), (0.72, 4.0), (0.72, 5.5), (1.1, 5.5), (1.2, 3.5)

@@ -17,8 +17,9 @@ import rerun.blueprint as rrb
 
 from pre_core.constants import NORMAL_975
 from schemas.results import Prior
+from services.common.arrays import Floats
 from services.viewer.crossing_scene import CrossingScene, Panel
-from services.viewer.crossing_view import FloatArray, ParameterRow
+from services.viewer.crossing_view import ParameterRow
 from services.viewer.rerun_parts import (
     MUTED,
     WEAK,
@@ -105,7 +106,7 @@ def _log(recording: RerunStream, scene: CrossingScene, rows: Sequence[PriorPoste
         plain = WEAK if row.name in weak_names else "#56B4E9"
         return rgb("#d5d9dd" if doubtful else plain)
 
-    down: FloatArray = _ROW * np.arange(len(rows), dtype=np.float64)
+    down: Floats = _ROW * np.arange(len(rows), dtype=np.float64)
     priors = [[(row.prior[0], y), (row.prior[1], y)] for row, y in zip(rows, down, strict=True)]
     log_strips(recording, f"{entity}/prior", priors, [rgb("#3a4148")], 5.0, is_behind=True)
     colours = [colour(row) for row in rows]

@@ -12,8 +12,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from services.common.arrays import Floats
 from services.viewer.crossing_scene import CrossingScene, Panel
-from services.viewer.crossing_view import FloatArray, ResidualCells
+from services.viewer.crossing_view import ResidualCells
 from services.viewer.rerun_parts import RerunStream, flat_view, log_labels
 
 _KINDS = ("profiles", "front body", "rear body")
@@ -36,7 +37,7 @@ def _log(recording: RerunStream, scene: CrossingScene, cells: ResidualCells) -> 
     crossing, entity = scene.crossing, f"{scene.root}/residuals"
     kinds, stretches, bands = cells.mean_square.shape
     shades = _shades(cells)
-    across: FloatArray = np.arange(bands, dtype=np.float64) + 0.5
+    across: Floats = np.arange(bands, dtype=np.float64) + 0.5
     down = _rows(kinds, stretches)
     for kind in range(kinds):
         block = np.repeat(np.repeat(shades[kind], _PIXELS, axis=0), _PIXELS, axis=1)
@@ -67,7 +68,7 @@ def band_names(cells: ResidualCells) -> list[str]:
     ]
 
 
-def _rows(kinds: int, stretches: int) -> FloatArray:
+def _rows(kinds: int, stretches: int) -> Floats:
     """Return the middles of all rows from top to bottom, with gaps between the kinds."""
     number = np.arange(kinds * stretches)
     return np.asarray(number + 0.5 + _GAP * (number // stretches), dtype=np.float64)

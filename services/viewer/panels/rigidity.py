@@ -8,8 +8,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from services.common.arrays import Floats
 from services.viewer.crossing_scene import CrossingScene, Panel
-from services.viewer.crossing_view import VEHICLE_COLOURS, FloatArray
+from services.viewer.crossing_view import VEHICLE_COLOURS
 from services.viewer.rerun_parts import (
     BASELINE,
     LABEL,
@@ -30,7 +31,7 @@ from services.viewer.strip import (
 )
 
 
-def _layout(scene: CrossingScene, _: FloatArray) -> rrb.Container:
+def _layout(scene: CrossingScene, _: Floats) -> rrb.Container:
     doubt = "DOUBTFUL: " if scene.crossing.is_doubtful else ""
     return rrb.Tabs(
         flat_view(
@@ -48,7 +49,7 @@ def _layout(scene: CrossingScene, _: FloatArray) -> rrb.Container:
     )
 
 
-def log_rigidity(recording: RerunStream, scene: CrossingScene, rigidity_nm2: FloatArray) -> None:
+def log_rigidity(recording: RerunStream, scene: CrossingScene, rigidity_nm2: Floats) -> None:
     """Log EI of each element as bars, and as a strip along the span."""
     crossing, root, baseline = scene.crossing, scene.root, scene.baseline
     edges = crossing.element_edges_m
@@ -96,9 +97,9 @@ def log_rigidity(recording: RerunStream, scene: CrossingScene, rigidity_nm2: Flo
 def _log_whiskers(
     recording: RerunStream,
     entity: str,
-    across: FloatArray,
-    tips: FloatArray,
-    limits: tuple[FloatArray, FloatArray],
+    across: Floats,
+    tips: Floats,
+    limits: tuple[Floats, Floats],
     top: float,
 ) -> None:
     """Draw intervals; one that exceeds the strip has no bar at that end."""
@@ -115,8 +116,8 @@ def _log_whiskers(
 def _log_level(
     recording: RerunStream,
     entity: str,
-    edges_m: FloatArray,
-    rows: FloatArray,
+    edges_m: Floats,
+    rows: Floats,
     name: str,
     colour: str,
 ) -> None:

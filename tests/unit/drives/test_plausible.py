@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from schemas.site_file import load_site
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.drives.csv_import import read_folder
 from services.drives.plausible import check_plausible
-from services.drives.runs import Floats, GnssTrack, Run
+from services.drives.runs import GnssTrack, Run
 
 _METRE_DEG = 1.0 / 111_200.0
 

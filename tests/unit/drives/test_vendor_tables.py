@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from schemas.signals import CHANNELS
 from schemas.site import Site
 from schemas.site_file import parse_site
+from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.drives.csv_runs import AS_WRITTEN, HowToRead, csv_runs, understood_runs
 from services.drives.runs import Run
@@ -22,7 +22,6 @@ from services.drives.tables.mapping import load_map, map_text
 from services.drives.tables.preview import preview_lines
 from services.drives.tables.reading import Understood
 
-Floats = NDArray[np.float64]
 Columns = dict[str, Floats]
 
 RATE_HZ = 500

@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from schemas.site import Bridge, Receiver
+from services.common.arrays import Floats
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.finding.bridges import Bridges, StaySearch
 from services.finding.stays import Passage, Stay
@@ -15,7 +15,6 @@ from services.finding.streams import Fixes
 from services.simulation.drive import paper_site
 from services.simulation.positions import _altitude_m
 
-Floats = NDArray[np.float64]
 ONE = paper_site().bridges[0]
 TRUCK = paper_site().vehicles[0]
 RECEIVER = Receiver()

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pre_core.physics.simulate import Motion
 from schemas.errors import InputError
@@ -18,6 +17,7 @@ from schemas.site import Site, Vehicle
 from schemas.site_file import load_site
 from schemas.site_sensors import PlacedSensor
 from services.cli import main as cli
+from services.common.arrays import Floats
 from services.common.geodesy import bridge_frame, to_chainage
 from services.drives.csv_import import read_folder
 from services.drives.runs import Run
@@ -36,7 +36,6 @@ from services.simulation.drawn import identify_simulated
 from services.simulation.drive import paper_site
 from tests.unit.identification.test_engine import drive, legs, rejected
 
-Floats = NDArray[np.float64]
 PAPER = paper_site()
 
 

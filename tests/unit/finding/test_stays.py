@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from services.common.arrays import Floats
 from services.finding.stays import (
     CORRIDOR_M,
     STANDING_M_PER_S,
@@ -17,8 +18,6 @@ from services.finding.stays import (
     _senses,
     find_stays,
 )
-
-Floats = NDArray[np.float64]
 
 SPAN_M = 30.0
 WHEELBASE_M = 4.4

@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from schemas.signals import CHANNELS, AccelBatch, AccelChannel, GnssFix, encode_accel, encode_gnss
+from services.common.arrays import Floats
 from services.finding.streams import PATIENCE_S, Boot, Samples, device_time_ns
-
-Floats = NDArray[np.float64]
 
 NS = 1_000_000_000
 START_NS = 7 * 3600 * NS  # the truck has been on for seven hours

@@ -17,6 +17,7 @@ from schemas.signals import CHANNELS, VehicleInfo, decode_accel, encode_accel, e
 from schemas.site import Site
 from schemas.site_file import site_hash, vehicle_toml
 from schemas.topics import Key, Message
+from services.common.arrays import Floats
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.finding import traffic
@@ -24,7 +25,6 @@ from services.identification.outputs import Output
 from services.simulation.drive import SimulatedDrive, paper_site
 from tests.working_engine import WorkingEngine
 
-Floats = NDArray[np.float64]
 START_S = 1_767_225_600.0
 SITE = paper_site()
 

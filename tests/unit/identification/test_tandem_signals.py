@@ -5,11 +5,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason
 from schemas.site import Vehicle
+from services.common.arrays import Floats
 from services.finding.placed import middle_names
 from services.identification.signal_checks import reasons_before_fit
 from services.simulation.drawn_tandem import TandemWorld, drawn_tandem
@@ -18,8 +18,6 @@ from services.simulation.wide_crossings import drive_case, site_of
 from studies.simulation.tandem_cases import draw_tandem
 from studies.simulation.truths import default_site
 from studies.validation.surveys import crossing_truth, site_of_truck
-
-Floats = NDArray[np.float64]
 
 
 @cache

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pre_core.crossing.middle import (
     Reduction,
@@ -10,8 +9,8 @@ from pre_core.crossing.middle import (
     centre_readings,
     centre_reduction,
 )
+from services.common.arrays import Floats
 
-Floats = NDArray[np.float64]
 WHEELBASE_M = 5.0
 TOLERANCE_M = 0.05
 

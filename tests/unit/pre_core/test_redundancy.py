@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pre_core.diagnostics.redundancy import RedundancyResidual, motion_ratio, redundancy_residual
+from services.common.arrays import Floats
 
-Floats = NDArray[np.float64]
 STEP_S = 0.002
 DENSITY = 25e-6 * 9.80665
 PARITY = np.array([[1.0, -1.0, -1.0, 1.0]]) / (2.0 * DENSITY)

@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pre_core.crossing.splines import value_at
 from pre_core.crossing.trajectory import Trajectory, arrival_time_s, fit_trajectory, motion_at
-
-Floats = NDArray[np.float64]
+from services.common.arrays import Floats
 
 POSITION_NOISE_M = 0.4
 SPEED_NOISE_M_PER_S = 0.07
