@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from services.common.endpoints import OnTheBus
 from services.common.options import (
@@ -17,6 +18,10 @@ from services.common.options import (
 )
 
 _PATTERNS = "patterns with * and ?, separated by commas, of STREAM or OWNER/ID/STREAM"
+
+
+def _selection(text: str, metavar: str) -> Any:
+    return opt(text, names, group="selection", default=(), action="extend", metavar=metavar)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,29 +61,12 @@ class ReplaySettings(OnTheBus):
         "repeat until stopped (loggers and workers use the first pass only)", group="time"
     )
     paused: bool = flag("begin paused; needs a terminal", group="time")
-    topics: tuple[str, ...] = opt(
-        f"topics to publish: {_PATTERNS} (accel,gnss or vehicle/*/accel)",
-        names,
-        group="selection",
-        default=(),
-        action="extend",
-        metavar="PATTERN",
+    topics: tuple[str, ...] = _selection(
+        f"topics to publish: {_PATTERNS} (accel,gnss or vehicle/*/accel)", "PATTERN"
     )
-    exclude: tuple[str, ...] = opt(
-        "topics to leave out, given as for --topics",
-        names,
-        group="selection",
-        default=(),
-        action="extend",
-        metavar="PATTERN",
-    )
-    vehicle: tuple[str, ...] = opt(
-        "publish the messages of these trucks only, and no results",
-        names,
-        group="selection",
-        default=(),
-        action="extend",
-        metavar="ID",
+    exclude: tuple[str, ...] = _selection("topics to leave out, given as for --topics", "PATTERN")
+    vehicle: tuple[str, ...] = _selection(
+        "publish the messages of these trucks only, and no results", "ID"
     )
     rename: tuple[str, ...] = opt(
         "publish a truck under another name (the messages themselves stay as they are)",

@@ -1,12 +1,20 @@
-"""A bus with two sessions in this process."""
+"""A bus with two sessions in this process, and the site file of the docs."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import zenoh
 
+from schemas.site import Site
+from schemas.site_file import load_site
 from services.bus.session import open_session
 from tests.waiting import LONGEST_S
+
+
+@pytest.fixture(scope="session")
+def site(project: Path) -> Site:
+    return load_site(project / "docs/site.example.toml")
 
 
 @pytest.fixture

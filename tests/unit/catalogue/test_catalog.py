@@ -15,7 +15,6 @@ import pytest
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import AccelBatch, AccelChannel, GnssFix, encode_accel, encode_gnss
 from schemas.site import Site
-from schemas.site_file import load_site
 from schemas.topics import Key, Message
 from services.catalogue import index as catalog
 from services.catalogue.contents import summarise_recording
@@ -34,11 +33,6 @@ S = 1_000_000_000
 START_NS = 1_700_000_000 * S
 EAST_DEG_PER_S = 2.2e-4
 """Some 20 m/s along the bridge of the example."""
-
-
-@pytest.fixture(scope="module")
-def site(project: Path) -> Site:
-    return load_site(project / "docs/site.example.toml")
 
 
 def drive(site: Site, seconds: range, turns_s: tuple[int, ...], boot: int = 7) -> Iterator[Message]:

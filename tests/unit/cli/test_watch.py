@@ -2,14 +2,12 @@
 
 import io
 import threading
-from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.site import Site
-from schemas.site_file import load_site
 from services.bus.realm_listener import BusMessage
 from services.cli import main as cli
 from services.cli import realm_model
@@ -33,11 +31,6 @@ from tests.unit.cli.watching import (
     result,
     state,
 )
-
-
-@pytest.fixture(scope="module")
-def site(project: Path) -> Site:
-    return load_site(project / "docs/site.example.toml")
 
 
 def drawn(

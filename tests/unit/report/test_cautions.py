@@ -24,10 +24,9 @@ from services.viewer.bridge_figure import draw_bridge
 from services.viewer.drawing import STYLE
 from tests.unit.history.test_bridge_history import alarm
 from tests.unit.history.test_history_store import BEGIN_S
-from tests.unit.report.test_report import KNOWN, Seen, fused, reported, site
+from tests.unit.report.test_report import KNOWN, Seen, fused, reported
 from tests.unit.viewer.found import RATIOS, results_of, some_crossing
 
-__all__ = ["site"]
 GAP, OUTAGE = Reason.GAP_ON_BRIDGE, Reason.POSITION_OUTAGE
 HALF_YEAR_S = 182.0 * 86400.0
 

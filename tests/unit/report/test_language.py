@@ -25,10 +25,9 @@ from services.viewer.drawing import STYLE, figure_bytes
 from services.viewer.history_figure import draw_history, history_view
 from tests.unit.history.test_bridge_history import alarm
 from tests.unit.history.test_history_store import crossings
-from tests.unit.report.test_report import KNOWN, Seen, fused, reported, site
+from tests.unit.report.test_report import KNOWN, Seen, fused, reported
 from tests.unit.viewer.found import RATIOS, results_of, some_crossing
 
-__all__ = ["site"]
 GERMAN = language_of("de")
 OTHERS = [language_of(code) for code in LANGUAGES if code != "en"]
 

@@ -12,7 +12,7 @@ import pytest
 from schemas.reasons import REASON_TEXTS, BridgeReason, Reason
 from schemas.results import Prior, Results, results_json
 from schemas.site import Site
-from schemas.site_file import load_site, site_toml
+from schemas.site_file import site_toml
 from services.cli.identify import _fit_lines
 from services.common.errors import FailureError
 from services.common.language import ENGLISH, language_of
@@ -27,11 +27,6 @@ from services.report.place import ends_of, start_of
 from tests.builders.commands import run
 from tests.fleet import losses_of
 from tests.unit.viewer.found import RATIOS, results_of, some_crossing
-
-
-@pytest.fixture(scope="module")
-def site(project: Path) -> Site:
-    return load_site(project / "docs/site.example.toml")
 
 
 class Seen(HTMLParser):

@@ -23,7 +23,6 @@ from schemas.signals import (
     encode_gnss,
 )
 from schemas.site import Site
-from schemas.site_file import load_site
 from schemas.topics import Key
 from services.bus.realm_listener import BusMessage
 from services.cli import main as cli
@@ -62,11 +61,6 @@ class Live(NamedTuple):
         self.recording.disconnect()
         chunks: list[Chunk] = list(RrdReader(self.path).stream())
         return chunks
-
-
-@pytest.fixture
-def site(project: Path) -> Site:
-    return load_site(project / "docs/site.example.toml")
 
 
 def made(path: Path, site: Site | None) -> Live:

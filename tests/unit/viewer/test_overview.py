@@ -33,11 +33,6 @@ from tests.unit.viewer.found import results_of, some_crossing
 from tests.viewer_screen import complaints, opened, picture, pixels, view_named
 
 
-@pytest.fixture
-def site(project: Path) -> Site:
-    return load_site(project / "docs/site.example.toml")
-
-
 def converted(folder: Path, site: Site, verdict: str) -> dict[str, Chunk]:
     """What `driveby view` draws of results, with a recording beside them."""
     reasons = () if verdict == "good" else ("position_outage",)

@@ -15,7 +15,6 @@ from matplotlib.patches import Rectangle
 
 from schemas.results import CrossingResult, Results, results_json
 from schemas.site import Site
-from schemas.site_file import load_site
 from services.cli import main as cli
 from services.common.language import ENGLISH, language_of
 from services.viewer.bridge_figure import draw_bridge
@@ -35,11 +34,6 @@ from tests.unit.words import assert_words_apart, words
 def style() -> Any:
     with matplotlib.rc_context(STYLE):
         yield
-
-
-@pytest.fixture(scope="module")
-def site(project: Path) -> Site:
-    return load_site(project / "docs/site.example.toml")
 
 
 def bars(figure: Figure) -> list[Rectangle]:

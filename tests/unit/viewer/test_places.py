@@ -8,7 +8,7 @@ from rerun.chunk import RrdReader
 
 from schemas.signals import GnssFix, encode_gnss
 from schemas.site import Site
-from schemas.site_file import load_site, site_toml
+from schemas.site_file import site_toml
 from schemas.topics import Key, Message
 from services.catalogue.contents import summarise_recording
 from services.common.geodesy import bridge_frame, to_lat_lon
@@ -20,11 +20,6 @@ from services.viewer.rerun_parts import WEAK, ratio_colours, rgb
 from services.viewer.view import convert
 from tests.unit.drives.recorded import START_NS, drive
 from tests.unit.viewer.found import results_of, some_crossing
-
-
-@pytest.fixture
-def site(project: Path) -> Site:
-    return load_site(project / "docs/site.example.toml")
 
 
 def over_the_bridge(site: Site) -> list[Message]:
