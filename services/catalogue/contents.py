@@ -119,7 +119,8 @@ def summarise_recording(
 
     info = read_info(path, note, progress)
     known, site_error = (site, None) if site is not None else _own_site(path, info.site_toml)
-    times = [t for (where, _), h in streams.items() if not _is_latched(where) for t in h.times_ns]
+    latched = {where for where, _ in streams if topic(where.owner, where.stream).latched}
+    times = [t for (where, _), h in streams.items() if where not in latched for t in h.times_ns]
     return RecordingSummary(
         path,
         path.stat().st_size,
@@ -190,10 +191,6 @@ def _rates(drives: Iterable[DriveMessages]) -> dict[tuple[str, str], dict[str, f
             declared = {name: channel.rate_hz for name, channel in batch.channels.items()}
             rates.setdefault((drive.realm, drive.vehicle), declared)
     return rates
-
-
-def _is_latched(where: Key) -> bool:
-    return topic(where.owner, where.stream).latched
 
 
 def _own_site(path: Path, text: str | None) -> tuple[Site | None, str | None]:

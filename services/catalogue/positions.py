@@ -156,7 +156,8 @@ class _PositionReader:
             return at[number]
 
         # A chunk with a long time span holds late messages: it is read whatever surrounds it.
-        late = {n for n, c in enumerate(chunks) if _length_ns(c) >= _STEP_NS}
+        spans_ns = [chunk.message_end_time - chunk.message_start_time for chunk in chunks]
+        late = {number for number, span_ns in enumerate(spans_ns) if span_ns >= _STEP_NS}
         ends = sorted({0, len(chunks) - 1, *late}) if chunks else []
         waiting = [*pairwise([*ends[:1], *ends]), *((number, number) for number in late)]
         while waiting:
@@ -173,10 +174,6 @@ class _PositionReader:
                 waiting += [(first, middle), (middle, last)]
             else:
                 yield from ((a - _AROUND_NS, b + _AROUND_NS) for a, b in near)
-
-
-def _length_ns(chunk: ChunkIndex) -> int:
-    return int(chunk.message_end_time - chunk.message_start_time)
 
 
 def _fixes(

@@ -30,7 +30,7 @@ def declared(inputs: Iterable[Path], outputs: Iterable[Path]) -> Iterator[None]:
     named: dict[Path, Path] = {}
     try:
         for path in outputs:
-            if named.setdefault(_full(path), path) is not path:
+            if named.setdefault(Path(os.path.realpath(path)), path) is not path:
                 raise InputError(f"{path}: is given for two outputs; give each a name of its own")
             _outputs.append(path)
             check_no_input(path)
@@ -65,7 +65,3 @@ def _identity(path: Path) -> _Identity | None:
     except (OSError, ValueError):
         return None
     return (status.st_dev, status.st_ino) if S_ISREG(status.st_mode) else None
-
-
-def _full(path: Path) -> Path:
-    return Path(os.path.realpath(path))

@@ -91,7 +91,8 @@ class Resampler:
         measured = stamp_ns - self._early[0][0] >= _MEASURED_S * NS_PER_S
         # A wrong declared rate is detected in half the time at twice that rate, and memory is
         # bounded.
-        if len(self._early) < _FEWEST or not (measured or len(self._early) > self._most_early()):
+        most = 2 * _MEASURED_S * self._declared_hz + _FEWEST
+        if len(self._early) < _FEWEST or not (measured or len(self._early) > most):
             return []
         return self._begin()
 
@@ -109,9 +110,6 @@ class Resampler:
             return self.finish()
         finally:
             self._rate_hz, self._behind = 0.0, 0
-
-    def _most_early(self) -> float:
-        return 2 * _MEASURED_S * self._declared_hz + _FEWEST
 
     def _begin(self) -> list[SampleBlock]:
         """Measure the rate, and convert the samples up to now."""

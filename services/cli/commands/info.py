@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -275,13 +276,10 @@ def _number_of_crossings(found: "list[RecordingSummary]") -> int:
         name = (one.realm, one.vehicle, one.bridge, one.forward)
         by_truck.setdefault(name, []).append(one)
     return sum(
-        sum(not _is_same(*pair) for pair in pairwise(sorted(of_truck, key=_entry))) + 1
+        sum(not _is_same(*pair) for pair in pairwise(sorted(of_truck, key=attrgetter("entry_ns"))))
+        + 1
         for of_truck in by_truck.values()
     )
-
-
-def _entry(passing: "DetectedCrossing") -> int:
-    return passing.entry_ns
 
 
 def _is_same(earlier: "DetectedCrossing", later: "DetectedCrossing") -> bool:
