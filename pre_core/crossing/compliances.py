@@ -29,7 +29,7 @@ from pre_core.crossing.posterior import (
     rigidity_spread,
 )
 from pre_core.crossing.preparation import mismatch_gradient
-from pre_core.kernels.lanes import kernel
+from pre_core.kernels.lanes import inner, kernel
 
 _SETTLING = 500
 _SWEEPS = 60
@@ -260,16 +260,17 @@ def _gibbs(
                 y[i] = x[i]
         done = sweep - settling
         if done >= 0 and done % _SWEEPS == _SWEEPS - 1:
-            out[done // _SWEEPS] = y
+            for i in range(k):
+                out[done // _SWEEPS, i] = y[i]
 
 
-@kernel
+@inner
 def _log_conditional(y: float, pull: float, own: float, sigma: float, inflation: float) -> float:
     c = exp(-sigma * y)
     return pull * c - 0.5 * own * c * c - 0.5 * (y / inflation) ** 2
 
 
-@kernel
+@inner
 def _slice(
     rng: np.random.Generator, y: float, pull: float, own: float, sigma: float, inflation: float
 ) -> float:
@@ -296,7 +297,7 @@ def _slice(
     return y
 
 
-@kernel
+@inner
 def _truncated_draw(rng: np.random.Generator, pull: float, own: float, log_odds: float) -> float:
     """Draw from a normal truncated at zero with a point mass there."""
     if log_odds == np.inf:

@@ -11,7 +11,7 @@ from pre_core.crossing import tandem
 from pre_core.crossing.arguments import LONGEST_STRETCH, Buffers, EvaluationPoints, GriddedCrossing
 from pre_core.crossing.step_tables import PHASES as _PHASES
 from pre_core.crossing.step_tables import STEP_REACH as _STEP_REACH
-from pre_core.kernels.lanes import LANES, kernel
+from pre_core.kernels.lanes import LANES, inner
 from pre_core.parameters import EI_1, FIRST_OF_BRIDGE, RHO_A, TORSION
 from pre_core.physics import modal_response
 from pre_core.physics.beam_basis import ModalFilters
@@ -21,7 +21,7 @@ SWING_MODES = 3
 """Number of modes with initial vibration; a load excites the j-th by 1/j^2 of the first."""
 
 
-@kernel
+@inner
 def update_modes(crossing: GriddedCrossing, work: Buffers, theta: FloatArray) -> bool:
     """Compute the modes at `theta` (p,) in the work arrays, unless they are there already.
 
@@ -42,11 +42,12 @@ def update_modes(crossing: GriddedCrossing, work: Buffers, theta: FloatArray) ->
     if not torsion_filters(crossing.torsion, theta, crossing.step_s, work.cubics, work.feedback):
         work.modes_of[:] = np.nan
         return False
-    work.modes_of[:] = theta
+    for i in range(theta.size):
+        work.modes_of[i] = theta[i]
     return True
 
 
-@kernel
+@inner
 def _soften_ends(
     crossing: GriddedCrossing,
     front: FloatArray,
@@ -72,7 +73,7 @@ def _soften_ends(
         force[i] *= 0.5 + 0.5 * min(1.0, min(from_start, from_end) / step)
 
 
-@kernel
+@inner
 def _apply_end_steps(
     crossing: GriddedCrossing, work: Buffers, front: FloatArray, offset: float, w: int
 ) -> None:
@@ -119,7 +120,7 @@ def _apply_end_steps(
             work.at_end[j] = True
 
 
-@kernel
+@inner
 def _set_initial_vibration(
     crossing: GriddedCrossing, work: Buffers, rho_a: float, amplitude: FloatArray
 ) -> None:
@@ -135,7 +136,7 @@ def _set_initial_vibration(
         modal_response.add_free_vibration(work.feedback, work.state, work.modes[k], k, q, v)
 
 
-@kernel
+@inner
 def add_deflection(
     crossing: GriddedCrossing, work: Buffers, points: EvaluationPoints, k: int
 ) -> None:
@@ -194,7 +195,7 @@ def add_deflection(
         _quasi_static_twist(crossing, work, points, k, last)
 
 
-@kernel
+@inner
 def _advance(work: Buffers, begin: int, stop: int) -> None:
     """Advance all modes over the samples of a stretch in which each wheel stays in one part."""
     if work.part.shape[0] == 3:
@@ -210,7 +211,7 @@ def _advance(work: Buffers, begin: int, stop: int) -> None:
         modal_response.advance(filters, wheels)
 
 
-@kernel
+@inner
 def _quasi_static_twist(
     crossing: GriddedCrossing, work: Buffers, points: EvaluationPoints, k: int, last: int
 ) -> None:

@@ -24,7 +24,7 @@ from pre_core.crossing.step_tables import PHASES as _PHASES
 from pre_core.crossing.step_tables import SINC_TAPS as _SINC_TAPS
 from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_SPRING_N_PER_M
 from pre_core.crossing.whitening import Whitener, project_out_noise, whiten_into
-from pre_core.kernels.lanes import kernel, summing
+from pre_core.kernels.lanes import inner, kernel, summing
 from pre_core.parameters import C_S1, C_U1, D_1, K_S1, K_U1, KAPPA, M_U1
 from pre_core.physics.vehicle import masses_above_axles, masses_on_axles
 
@@ -36,7 +36,7 @@ _NO_ROWS = RowFilter(_NOTHING, 1, 0.0, _NOTHING, _NOTHING, np.zeros((0, 0), dtyp
 _NO_FILTERS = (_NO_ROWS, Whitener(np.zeros((0, 0)), _NOTHING))
 
 
-@kernel
+@inner
 def _correct(
     signals: FloatArray,
     step: float,
@@ -67,7 +67,7 @@ def _correct(
             out_a[i] = g * a[i] + d1 * a1[i] + d2 * a2[i] + d3 * a3[i] + b
 
 
-@kernel
+@inner
 def _wheels(
     crossing: GriddedCrossing,
     work: Buffers,
@@ -120,7 +120,7 @@ def _wheels(
             body[i] = (inertial - spring - sign * transfer * speeding[i]) * hard
 
 
-@kernel
+@inner
 def _locate(crossing: GriddedCrossing, work: Buffers, front: FloatArray, wheelbase: float) -> None:
     edges = crossing.edges_m
     parts = edges.size - 1
@@ -144,7 +144,7 @@ def _locate(crossing: GriddedCrossing, work: Buffers, front: FloatArray, wheelba
             work.place[w, i] = (x - edges[e]) / (edges[e + 1] - edges[e])
 
 
-@kernel
+@inner
 def _locate_front_sample(
     crossing: GriddedCrossing,
     front: FloatArray,
@@ -207,7 +207,7 @@ def _read(
     return sum_road, sum_body
 
 
-@kernel
+@inner
 def _compare(crossing: GriddedCrossing, work: Buffers, out: FloatArray) -> None:
     """Compute all residuals to `out` (3, rows), at the times of `_locate_front_sample`."""
     road, body = work.road, work.body
@@ -247,7 +247,8 @@ def _evaluate(
             continue
         road = work.road.reshape(work.road.size)
         if what == _DEFLECTIONS:
-            row[:] = road
+            for i in range(row.size):
+                row[i] = road[i]
         elif not _locate_front_sample(
             crossing, points.position_m[k], points.wheelbase_m[k], work.begin, work.between
         ):
@@ -260,12 +261,14 @@ def _evaluate(
             continue
         _compare(crossing, work, work.residual)
         if what == _PLAIN:
-            row[:] = work.residual.reshape(work.residual.size)
+            residual = work.residual.reshape(work.residual.size)
+            for i in range(row.size):
+                row[i] = residual[i]
         else:
             whiten_into(rows, noise, work.residual, work.row, row[: noise.reciprocal.size])
 
 
-@kernel
+@inner
 def _is_possible(theta: FloatArray, wheelbase_m: float, lead_base_m: float) -> bool:
     for i in range(theta.size):
         if not np.isfinite(theta[i]):
@@ -273,7 +276,7 @@ def _is_possible(theta: FloatArray, wheelbase_m: float, lead_base_m: float) -> b
     return theta[D_1] < max(wheelbase_m, lead_base_m)
 
 
-@kernel
+@inner
 def _roads(crossing: GriddedCrossing, work: Buffers, points: EvaluationPoints, k: int) -> bool:
     """Compute the work arrays of point k up to the deflection; return False if impossible."""
     _correct(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pre_core.arrays import FloatArray
 from pre_core.crossing.arguments import Buffers, GriddedCrossing
 from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_SPRING_N_PER_M
-from pre_core.kernels.lanes import Lanes, fma, fma_scalar, kernel, load, mul, store
+from pre_core.kernels.lanes import Lanes, fma, fma_scalar, inner, kernel, load, mul, store
 from pre_core.parameters import C_S1, C_U1, K_S1, K_U1, M_U1, SHARE
 from pre_core.physics.tandem import Lead, lead_response, own_springs, shared_load
 
@@ -23,7 +23,7 @@ _SMOOTH_S = 0.5
 """Duration of the tapers at both ends of the record, against the wrap of the filter."""
 
 
-@kernel
+@inner
 def is_loaded(part: NDArray[np.int64], i: int) -> bool:
     """Return whether any wheel of `part` (wheels, n) is on the bridge at sample i."""
     loaded = False
@@ -32,7 +32,7 @@ def is_loaded(part: NDArray[np.int64], i: int) -> bool:
     return loaded
 
 
-@kernel
+@inner
 def are_parts_equal(part: NDArray[np.int64], i: int, j: int) -> bool:
     """Return whether each wheel of `part` (wheels, n) is in the same part at samples i and j."""
     equal = True
@@ -41,7 +41,7 @@ def are_parts_equal(part: NDArray[np.int64], i: int, j: int) -> bool:
     return equal
 
 
-@kernel
+@inner
 def add_tyre_damping(
     force: FloatArray, slope: float, bend: float, soft: float, road: FloatArray
 ) -> None:
@@ -61,7 +61,7 @@ def add_tyre_damping(
         road[last] += slope * soft * 12.0 * (force[last] - force[last - 1])
 
 
-@kernel
+@inner
 def wheels(
     crossing: GriddedCrossing,
     work: Buffers,
@@ -111,7 +111,7 @@ def wheels(
             add_tyre_damping(force, slope, (tau / crossing.step_s) ** 2, soft, road)
 
 
-@kernel
+@inner
 def _shared_force(
     crossing: GriddedCrossing,
     work: Buffers,
@@ -134,7 +134,7 @@ def _shared_force(
         second[i] = rest * bogie
 
 
-@kernel
+@inner
 def _own_forces(
     crossing: GriddedCrossing,
     work: Buffers,
@@ -180,7 +180,7 @@ def _own_forces(
         of_lead[i] = first[i] + second[i] - whole_1 * a_1[i] - whole_2 * a_2[i]
 
 
-@kernel
+@inner
 def _cubic(cubics: FloatArray, part: int, group: int) -> tuple[Lanes, Lanes, Lanes, Lanes]:
     """Return the coefficients of a group of modes in a part; zeros for a wheel off the bridge."""
     zero = (0.0, 0.0, 0.0, 0.0)
@@ -190,7 +190,7 @@ def _cubic(cubics: FloatArray, part: int, group: int) -> tuple[Lanes, Lanes, Lan
     return load(here, 0), load(here, 1), load(here, 2), load(here, 3)
 
 
-@kernel
+@inner
 def _value(c: tuple[Lanes, Lanes, Lanes, Lanes], x: float) -> Lanes:
     return fma_scalar(fma_scalar(fma_scalar(c[3], x, c[2]), x, c[1]), x, c[0])
 

@@ -9,7 +9,7 @@ diagonal.
 import numpy as np
 
 from pre_core.arrays import FloatArray
-from pre_core.kernels.lanes import LANES, Lanes, fma, kernel, load, mul, store
+from pre_core.kernels.lanes import LANES, Lanes, fma, inner, kernel, load, mul, store
 
 MAX_SWEEPS = 30
 """Bound for matrices with values that are not finite; others need a few sweeps."""
@@ -18,7 +18,7 @@ _NEGLIGIBLE = 1e-16
 is far below rounding."""
 
 
-@kernel
+@inner
 def _rotation(a: FloatArray, p: int, q: int, cosine: FloatArray, sine: FloatArray) -> float:
     """Compute cosine and sine (4,) that annul a_pq; return its excess over negligible."""
     left = -1.0
@@ -36,7 +36,7 @@ def _rotation(a: FloatArray, p: int, q: int, cosine: FloatArray, sine: FloatArra
     return left
 
 
-@kernel
+@inner
 def _rotate(x: FloatArray, i: int, y: FloatArray, j: int, c: Lanes, s: Lanes, n: Lanes) -> None:
     """Replace rows i of x and j of y by c x - s y and s x + c y; n is -s."""
     xi = load(x, i)
@@ -108,7 +108,7 @@ def diagonalise_one(a: FloatArray, v: FloatArray) -> bool:
     return is_done
 
 
-@kernel
+@inner
 def _reverse(x: FloatArray) -> None:
     """Reverse the order of rows and columns in place."""
     flat = x.reshape(x.size)
@@ -117,7 +117,7 @@ def _reverse(x: FloatArray) -> None:
         flat[i], flat[last - i] = flat[last - i], flat[i]
 
 
-@kernel
+@inner
 def _sweep(a: FloatArray, v: FloatArray) -> bool:
     """Sweep over the upper triangle of `a` (m, m) until it converges; rotate rows of `v` too.
 

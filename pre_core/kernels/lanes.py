@@ -20,7 +20,10 @@ Lanes = tuple[float, float, float, float]
 
 LANES = 4
 
-compiled = partial(njit, cache=True, nogil=True)
+# A wrapper for calls from C or from Python contains the kernel once more and takes as long to
+# compile. C calls none. Kernels copy rows by loops: an assignment to a slice checks its shape, and
+# the check takes three seconds to compile.
+compiled = partial(njit, cache=True, nogil=True, no_cfunc_wrapper=True)
 
 # A kernel that calls another one holds a copy of it, optimised once more with it: rounded otherwise
 # than the first one. Which of them is run, where it is not inlined, depends on which was loaded
@@ -32,19 +35,25 @@ exact = _inlined()
 
 # Contraction allows fused multiply-add; no other reordering of the arithmetic is allowed, so that
 # results depend only to rounding on which vectors are evaluated together.
-kernel = _inlined(fastmath={"contract", "nsz"})
+_CONTRACTED = {"contract", "nsz"}
+kernel = _inlined(fastmath=_CONTRACTED)
 
 # For sums over many terms, which may be taken in any order.
 summing = _inlined(fastmath={"contract", "nsz", "reassoc"})
 
+# For kernels that only kernels call: a call from Python would end the process.
+_inner = partial(_inlined, no_cpython_wrapper=True)
+inner = _inner(fastmath=_CONTRACTED)
+inner_exact = _inner()
 
-@kernel
+
+@inner
 def load(a: FloatArray, i: int) -> Lanes:
     """Return row i of an array (n, 4)."""
     return (a[i, 0], a[i, 1], a[i, 2], a[i, 3])
 
 
-@kernel
+@inner
 def store(a: FloatArray, i: int, v: Lanes) -> None:
     """Write row i of an array (n, 4)."""
     a[i, 0] = v[0]
@@ -53,37 +62,37 @@ def store(a: FloatArray, i: int, v: Lanes) -> None:
     a[i, 3] = v[3]
 
 
-@kernel
+@inner
 def add(a: Lanes, b: Lanes) -> Lanes:
     """Return a + b."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3])
 
 
-@kernel
+@inner
 def sub(a: Lanes, b: Lanes) -> Lanes:
     """Return a - b."""
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2], a[3] - b[3])
 
 
-@kernel
+@inner
 def mul(a: Lanes, b: Lanes) -> Lanes:
     """Return a b."""
     return (a[0] * b[0], a[1] * b[1], a[2] * b[2], a[3] * b[3])
 
 
-@kernel
+@inner
 def scale(a: Lanes, s: float) -> Lanes:
     """Return a s, with one s for all lanes."""
     return (a[0] * s, a[1] * s, a[2] * s, a[3] * s)
 
 
-@kernel
+@inner
 def fma(a: Lanes, b: Lanes, c: Lanes) -> Lanes:
     """Return a b + c."""
     return (a[0] * b[0] + c[0], a[1] * b[1] + c[1], a[2] * b[2] + c[2], a[3] * b[3] + c[3])
 
 
-@kernel
+@inner
 def fma_scalar(a: Lanes, s: float, c: Lanes) -> Lanes:
     """Return a s + c, with one s for all lanes."""
     return (a[0] * s + c[0], a[1] * s + c[1], a[2] * s + c[2], a[3] * s + c[3])

@@ -32,6 +32,7 @@ def _newmark(acceleration: FloatArray, step_s: float, v: FloatArray, u: FloatArr
 
 def newmark_integrate(acceleration: FloatArray, step_s: float) -> IntegratedMotion:
     """Integrate rows of evenly spaced samples (channels, n) twice by Newmark's scheme."""
+    acceleration = np.ascontiguousarray(acceleration)
     v = np.zeros_like(acceleration)
     u = np.zeros_like(acceleration)
     _newmark(acceleration, step_s, v, u)

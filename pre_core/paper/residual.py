@@ -10,7 +10,18 @@ from typing import NamedTuple
 import numpy as np
 
 from pre_core.arrays import FloatArray
-from pre_core.kernels.lanes import LANES, fma, fma_scalar, kernel, load, mul, scale, store, sub
+from pre_core.kernels.lanes import (
+    LANES,
+    fma,
+    fma_scalar,
+    inner,
+    kernel,
+    load,
+    mul,
+    scale,
+    store,
+    sub,
+)
 from pre_core.paper.iep import iep_factors, input_profiles
 from pre_core.paper.window import LONGEST_STRETCH, PaperWindow
 from pre_core.parameters import D_1, KAPPA, M_U1
@@ -52,7 +63,7 @@ def workspace(window: PaperWindow) -> Workspace:
     )
 
 
-@kernel
+@inner
 def _vehicle_factors(
     theta: FloatArray, total_mass: float, wheelbase: float, gravity: float, out: FloatArray
 ) -> None:
@@ -78,7 +89,7 @@ def _vehicle_factors(
         out[12, lane] = p[M_U1 + 1]
 
 
-@kernel
+@inner
 def _march_stretch(
     window: PaperWindow,
     work: Workspace,
@@ -113,7 +124,7 @@ def _march_stretch(
     advance(filters, _wheels(window, work, begin, stop, element_front, element_rear))
 
 
-@kernel
+@inner
 def _wheels(
     window: PaperWindow, work: Workspace, begin: int, stop: int, front: int, rear: int
 ) -> WheelStretch:
@@ -129,7 +140,7 @@ def _wheels(
     )
 
 
-@kernel
+@inner
 def _all_beyond(values: tuple[float, float, float, float], limit: FloatArray) -> bool:
     beyond = True
     for lane in range(LANES):
@@ -190,7 +201,7 @@ def march_four(
             total[lane] = squares[lane]
 
 
-@kernel
+@inner
 def _rows(window: PaperWindow, road: FloatArray, lane: int, out: FloatArray) -> None:
     """Write weighted residuals of one vector to `out` (m,), nuisance columns not yet removed."""
     front, rear = road[0], road[1]
@@ -214,7 +225,8 @@ def objective_batch(
     for begin in range(0, count, LANES):
         for lane in range(LANES):
             source = min(begin + lane, count - 1)
-            four[lane] = theta[source]
+            for i in range(theta.shape[1]):
+                four[lane, i] = theta[source, i]
             four_limit[lane] = limit[source]
         march_four(window, work, four, four_limit, four_total)
         for lane in range(min(LANES, count - begin)):
@@ -230,7 +242,9 @@ def _residual_batch(
     no_limit = np.full(LANES, np.inf)
     for begin in range(0, count, LANES):
         for lane in range(LANES):
-            four[lane] = theta[min(begin + lane, count - 1)]
+            source = min(begin + lane, count - 1)
+            for i in range(theta.shape[1]):
+                four[lane, i] = theta[source, i]
         totals = np.empty(LANES)
         march_four(window, work, four, no_limit, totals)
         for lane in range(min(LANES, count - begin)):
@@ -309,7 +323,7 @@ def objective(window: PaperWindow, work: Workspace, theta: FloatArray) -> float:
     return total if np.isfinite(total) else np.inf
 
 
-@kernel
+@inner
 def _one_vector_stretch(
     window: PaperWindow,
     work: Workspace,

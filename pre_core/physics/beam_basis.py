@@ -27,7 +27,7 @@ from scipy.linalg import eigh
 
 from pre_core.arrays import FloatArray
 from pre_core.kernels.jacobi import diagonalise, diagonalise_one
-from pre_core.kernels.lanes import LANES, add, fma, fma_scalar, kernel, load, mul, store, sub
+from pre_core.kernels.lanes import LANES, add, fma, fma_scalar, inner, kernel, load, mul, store, sub
 from pre_core.parameters import ALPHA, BETA, EI_1, K_ROT, RHO_A, F
 from pre_core.physics.bridge import (
     element_cubics,
@@ -150,7 +150,7 @@ def stiffness_factors(theta: FloatArray, count: int) -> FloatArray:
     return np.concatenate(factors, axis=-1)[..., :count]
 
 
-@kernel
+@inner
 def stiffness_factor(theta: FloatArray, i: int) -> float:
     """Return factor i of `stiffness_factors` for one vector (p,), in kernels."""
     spring = i - (theta.size - EI_1)
@@ -161,7 +161,7 @@ def stiffness_factor(theta: FloatArray, i: int) -> float:
     return 1.0 / (theta[F + spring - 2] + RIGID_M_PER_N)
 
 
-@kernel
+@inner
 def modal_damping(theta: FloatArray, eigenvalue: float) -> float:
     """Return the Rayleigh damping alpha + beta omega^2 of a unit-mass mode for theta (p,)."""
     return theta[ALPHA] + theta[BETA] * eigenvalue
@@ -216,7 +216,7 @@ def modal_filters(
     return True
 
 
-@kernel
+@inner
 def diagonalise_bridge(
     basis_stiffness: FloatArray, theta: FloatArray, matrix: FloatArray, vectors: FloatArray
 ) -> bool:
@@ -237,7 +237,7 @@ def diagonalise_bridge(
     return diagonalise_one(matrix, vectors)
 
 
-@kernel
+@inner
 def shape_cubics(
     basis_cubics: FloatArray, vectors: FloatArray, size: FloatArray, out: FloatArray
 ) -> None:
@@ -263,7 +263,7 @@ def shape_cubics(
                 out[e, k // LANES, power, k % LANES] = row[k]
 
 
-@kernel
+@inner
 def modal_filters_one(
     basis: BeamBasis,
     theta: FloatArray,
@@ -296,7 +296,7 @@ def modal_filters_one(
     return True
 
 
-@kernel
+@inner
 def _one_mode_two_wheels(
     front: FloatArray,
     rear: FloatArray,
@@ -332,7 +332,7 @@ def _one_mode_two_wheels(
     store(state, 1, d)
 
 
-@kernel
+@inner
 def _one_mode_one_wheel(
     cubic: FloatArray,
     feedback: FloatArray,
@@ -361,7 +361,7 @@ def _one_mode_one_wheel(
     store(state, 1, d)
 
 
-@kernel
+@inner
 def advance(filters: ModalFilters, wheels: WheelStretch) -> None:
     """Advance all modes over a stretch: update `filters.state`, and *add* to the deflections."""
     front = filters.cubics[max(wheels.front, 0)]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.arrays import FloatArray
-from pre_core.kernels.lanes import compiled, exact
+from pre_core.kernels.lanes import compiled, inner_exact
 from pre_core.physics.vehicle import air_spring_excess_n, dahl_friction_n
 
 
@@ -84,7 +84,7 @@ class MarchOutputs(NamedTuple):
     friction: FloatArray  # (steps, 2)
 
 
-@exact
+@inner_exact
 def _strut(
     wheel: WheelForces, stroke: float, rate: float, before: float, change: float
 ) -> tuple[float, float]:
@@ -107,7 +107,7 @@ def _strut(
     return strut + friction, friction
 
 
-@exact
+@inner_exact
 def _shapes(
     cubics: FloatArray, xi: float, length: float, shape: FloatArray, slope: FloatArray
 ) -> None:
@@ -118,7 +118,7 @@ def _shapes(
         slope[k] = ((3.0 * c3 * xi + 2.0 * c2) * xi + c1) / length
 
 
-@exact
+@inner_exact
 def _end_deflection(cubics: FloatArray, element: int, q: FloatArray) -> float:
     """Return the deflection of the end of the bridge at its first or last element."""
     end = 0.0
@@ -203,10 +203,9 @@ def march(
             free[i] = 0.0
             for j in range(4):
                 free[i] -= damping[i, j] * zd_guess[j] + stiffness[i, j] * z_guess[j]
+            zd[i], z[i] = zd_guess[i], z_guess[i]
         free[0] += track.load_transfer[n]
         free[1] -= track.load_transfer[n]
-        zd[:] = zd_guess
-        z[:] = z_guess
         iterations = 0
         change = np.inf
         while iterations < 2 or not change <= scheme.tolerance:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pre_core.arrays import FloatArray
-from pre_core.kernels.lanes import LANES, fma, fma_scalar, kernel, load, mul, store
+from pre_core.kernels.lanes import LANES, fma, fma_scalar, inner, kernel, load, mul, store
 from pre_core.parameters import RHO_A
 from pre_core.physics.beam_basis import (
     BeamBasis,
@@ -53,7 +53,7 @@ class EndStretch(NamedTuple):
     """Share (2 wheels, 2 ends, steps) of an end's deflection that a wheel follows in addition."""
 
 
-@kernel
+@inner
 def _ramp_response(time: float, damping: float, eigenvalue: float) -> float:
     """Return the displacement of a mode at rest, `time` after a unit ramp force began."""
     half = 0.5 * damping
@@ -130,7 +130,8 @@ def modal_filters(
         total = mode_coefficients(eigenvalue, damping, step_s, one)
         if not total > 0.0:
             return False
-        feedback[group, :, lane] = one
+        for i in range(COEFFICIENTS):
+            feedback[group, i, lane] = one[i]
         size[k] = np.sqrt(total / theta[RHO_A])
         modes[k, 0], modes[k, 1] = eigenvalue, damping
         # In coordinates that diagonalise a similar bridge, a mode is nearly a unit vector.
@@ -148,7 +149,7 @@ def precompensate_force(force: FloatArray, out: FloatArray) -> None:
         out[n] = force[n] - (force[n + 1] - 2.0 * force[n] + force[n - 1]) / 12.0
 
 
-@kernel
+@inner
 def _two_wheels(
     front: FloatArray,
     rear: FloatArray,
@@ -181,7 +182,7 @@ def _two_wheels(
     store(state, 1, w2)
 
 
-@kernel
+@inner
 def _one_wheel(
     cubic: FloatArray,
     feedback: FloatArray,
@@ -206,7 +207,7 @@ def _one_wheel(
     store(state, 1, w2)
 
 
-@kernel
+@inner
 def _no_wheel(feedback: FloatArray, state: FloatArray, steps: int) -> None:
     f1, f2 = load(feedback, 0), load(feedback, 1)
     w1, w2 = load(state, 0), load(state, 1)
@@ -269,7 +270,7 @@ def add_free_vibration(
     state[group, 1, lane] += b_r * square_r - b_i * square_i
 
 
-@kernel
+@inner
 def _group_with_ends(
     filters: ModalFilters, g: int, wheels: LoadedStretch, ends: EndStretch
 ) -> None:
@@ -310,7 +311,7 @@ def _group_with_ends(
         state[0, lane], state[1, lane] = w1, w2
 
 
-@kernel
+@inner
 def advance_with_ends(filters: ModalFilters, wheels: LoadedStretch, ends: EndStretch) -> None:
     """Advance as `advance` does, with forces at the ends, whose motion the wheels follow."""
     for g in range(filters.feedback.shape[0]):

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.arrays import FloatArray
-from pre_core.kernels.lanes import LANES, kernel
+from pre_core.kernels.lanes import LANES, inner
 from pre_core.parameters import TORSION
 from pre_core.physics.beam_basis import modal_damping
 from pre_core.physics.modal_response import COEFFICIENTS, mode_coefficients
@@ -93,7 +93,7 @@ def sine_cubics(part_m: FloatArray, span_m: FloatArray, modes: int) -> FloatArra
     )
 
 
-@kernel
+@inner
 def torsion_filters(
     basis: TorsionBasis,
     theta: FloatArray,
@@ -120,7 +120,8 @@ def torsion_filters(
             if not total > 0.0:
                 return False
             group, lane = first + span * GROUPS + j // LANES, j % LANES
-            feedback[group, :, lane] = one
+            for i in range(COEFFICIENTS):
+                feedback[group, i, lane] = one[i]
             size = np.sqrt(total * per_mass)
             for part in range(cubics.shape[0]):
                 for power in range(4):
@@ -130,7 +131,7 @@ def torsion_filters(
     return True
 
 
-@kernel
+@inner
 def flexibility_remainder(
     basis: TorsionBasis, part: int, place: float, at_m: float, other: int, there: float, to_m: float
 ) -> float:

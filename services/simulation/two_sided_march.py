@@ -14,6 +14,9 @@ from pre_core.kernels.lanes import compiled
 from services.common.arrays import Floats, Ints
 from services.simulation.two_sided_deck import ExactModes
 
+# Kernels that only kernels call; see pre_core/kernels/lanes.py.
+_inner = compiled(error_model="numpy", no_cpython_wrapper=True)
+
 
 class TruckSystem(NamedTuple):
     """The truck's equations: M q'' + C q' + K q + friction = forces of the tyres."""
@@ -105,7 +108,7 @@ def march_exactly(
     steps, size = out.coordinates.shape[0] - 1, out.coordinates.shape[1]
     axles, tyres, springs = course.places.shape[1], course.lateral.size, system.friction_n.size
     count = modes.half.shape[0]
-    needs_slopes = system.tyre_damping.max() > 0.0
+    needs_slopes = _is_any_positive(system.tyre_damping)
     now = _Motion(
         np.zeros(size), np.zeros(size), np.zeros(springs), np.zeros(count), np.zeros(count)
     )
@@ -143,17 +146,37 @@ def march_exactly(
             _begin_stage(stage, course.step_s, is_on, modes, now, stages, at)
             _derivative(system, course, under, at, stages, (n, stage, is_on))
             if stage == 0:
-                out.coordinates[n] = now.q
-                out.acceleration[n] = stages.acceleration[0]
-                out.contact_force_n[n] = under.contact
-                out.deflection_m[n] = under.deflection
-                out.twist_rad[n] = under.twist
+                _write(out, n, now, stages, under)
                 if n == steps:
                     return
         _end_step(course.step_s, is_on, modes, stages, now)
 
 
-@compiled(error_model="numpy")
+@_inner
+def _copy(values: Floats, out: Floats) -> None:
+    for k in range(out.size):
+        out[k] = values[k]
+
+
+@_inner
+def _is_any_positive(values: Floats) -> bool:
+    largest = 0.0
+    for k in range(values.size):
+        largest = max(largest, values[k])
+    return largest > 0.0
+
+
+@_inner
+def _write(out: WideResponse, n: int, now: _Motion, stages: _Stages, under: _Under) -> None:
+    """Write the motion at the begin of step n."""
+    _copy(now.q, out.coordinates[n])
+    _copy(stages.acceleration[0], out.acceleration[n])
+    _copy(under.contact, out.contact_force_n[n])
+    _copy(under.deflection, out.deflection_m[n])
+    _copy(under.twist, out.twist_rad[n])
+
+
+@_inner
 def _shape(x: float, span: float, modes: ExactModes, out: Floats) -> None:
     """Write the mass-normalised modes at the chainage x to `out` (modes,), 0 off the bridge."""
     bending = modes.bending.shape[1]
@@ -182,7 +205,7 @@ def _shape(x: float, span: float, modes: ExactModes, out: Floats) -> None:
         before, sine = sine, twice * sine - before
 
 
-@compiled(error_model="numpy")
+@_inner
 def _move_bridge(
     course: WheelCourse, under: _Under, moment: int, speed: float, at: _Motion
 ) -> None:
@@ -202,7 +225,7 @@ def _move_bridge(
                 under.twist_rate[i] += yd
 
 
-@compiled(error_model="numpy")
+@_inner
 def _derivative(
     system: TruckSystem,
     course: WheelCourse,
@@ -258,13 +281,13 @@ def _derivative(
         qdd[n] /= system.mass[n]
 
 
-@compiled(error_model="numpy")
+@_inner
 def _moment(stage: int) -> int:
     """Return the moment of a stage in half steps: begin, middle, middle, end."""
     return 0 if stage == 0 else (2 if stage == 3 else 1)
 
 
-@compiled(error_model="numpy")
+@_inner
 def _shape_step(
     n: int, course: WheelCourse, modes: ExactModes, under: _Under, needs_slopes: bool
 ) -> None:
@@ -275,8 +298,8 @@ def _shape_step(
         index = min(2 * n + moment, course.places.shape[0] - 1)
         for i in range(shapes.shape[1]):
             if moment == 0 and n > course.first_on:
-                shapes[0, i] = shapes[2, i]
-                slopes[0, i] = slopes[2, i]
+                _copy(shapes[2, i], shapes[0, i])
+                _copy(slopes[2, i], slopes[0, i])
                 continue
             x = course.places[index, i]
             _shape(x, course.span_m, modes, shapes[moment, i])
@@ -284,10 +307,11 @@ def _shape_step(
                 slopes[moment, i] = 0.0
                 if near < x < course.span_m - near:
                     _shape(x + near, course.span_m, modes, under.ahead)
-                    slopes[moment, i] = (under.ahead - shapes[moment, i]) / near
+                    for k in range(under.ahead.size):
+                        slopes[moment, i, k] = (under.ahead[k] - shapes[moment, i, k]) / near
 
 
-@compiled(error_model="numpy")
+@_inner
 def _begin_stage(
     stage: int,
     step_s: float,
@@ -299,11 +323,11 @@ def _begin_stage(
 ) -> None:
     """Compute the state of a stage from that at the begin of the step and the stages before."""
     if stage == 0:
-        at.q[:] = now.q
-        at.qd[:] = now.qd
-        at.friction[:] = now.friction
-        at.w[:] = now.w
-        at.wd[:] = now.wd
+        _copy(now.q, at.q)
+        _copy(now.qd, at.qd)
+        _copy(now.friction, at.friction)
+        _copy(now.w, at.w)
+        _copy(now.wd, at.wd)
         return
     of = stage - 1
     ahead_s = step_s if stage == 3 else 0.5 * step_s
@@ -323,11 +347,11 @@ def _begin_stage(
         at.w[k] = half[k, 0, 0] * w + half[k, 0, 1] * wd + drive[k, 0] * force
         at.wd[k] = half[k, 1, 0] * w + half[k, 1, 1] * wd + drive[k, 1] * force
     if stage == 1:
-        stages.half_w[:] = at.w
-        stages.half_wd[:] = at.wd
+        _copy(at.w, stages.half_w)
+        _copy(at.wd, stages.half_wd)
 
 
-@compiled(error_model="numpy")
+@_inner
 def _end_step(step_s: float, is_on: bool, modes: ExactModes, stages: _Stages, now: _Motion) -> None:
     """Compute the state at the end of the step from its four stages."""
     v, a, f, p = stages.velocity, stages.acceleration, stages.friction_rate, stages.modal_force

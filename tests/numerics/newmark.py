@@ -20,7 +20,6 @@ class Response(NamedTuple):
     acceleration: FloatArray
 
 
-@compiled()
 def _march(
     damping: FloatArray,
     stiffness: FloatArray,
