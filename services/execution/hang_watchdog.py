@@ -30,10 +30,16 @@ class TaskLimits(NamedTuple):
 
     processor_s: float = LIMIT_S
     idle_s: float = IDLE_S
+    start_processor_s: float = LIMIT_S
+    """Limit of processor time of the start, before the task."""
+
+    def during(self, starts: bool) -> "TaskLimits":
+        """Return the limits of the start or, if the process has started, of its task."""
+        return self._replace(processor_s=self.start_processor_s) if starts else self
 
 
 class HangWatchdog:
-    """Watchdog of a process during one task."""
+    """Watchdog of a process during its start or one task."""
 
     def __init__(self, pid: int, limits: TaskLimits, now_s: float) -> None:
         """Begin to watch; `now_s` is the time by any steady clock."""

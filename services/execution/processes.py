@@ -356,12 +356,13 @@ class _Slot:
         if now_s < self._next_check_s:
             return
         self._next_check_s = now_s + _CHECK_EVERY_S
-        if self._watchdog is None:
-            self._watchdog = HangWatchdog(self._pid, self._limits, now_s)
+        starts = self.job is None or not self.is_warm.done()
+        if self._watchdog is None or starts != self._watches_start:
+            self._watchdog = HangWatchdog(self._pid, self._limits.during(starts), now_s)
+            self._watches_start: bool = starts
         why = self._watchdog.why_hung(now_s)
         if why:
             self._next_check_s = math.inf
-            starts = self.job is None or not self.is_warm.done()
             what = "is being started" if starts else f"works on {self.job and self.job.name}"
             _log.warning("the process that %s %s; ending it", what, why)
             with contextlib.suppress(ProcessLookupError):
