@@ -11,8 +11,9 @@ from functools import partial
 from typing import Final, NamedTuple
 
 from schemas.site import Bridge, Sensor, Site, Vehicle
-from schemas.site_damping import implied_first_frequency_hz, rayleigh_of
-from schemas.toml_text import parse_toml
+from schemas.site_damping import rayleigh_of
+from schemas.site_frequency import first_frequency_hz, given_frequencies
+from schemas.site_implied import MAX_BRIDGES, ImpliedQuantity
 
 _G_M_PER_S2: Final = 9.80665
 _FIRST_HZ: Final = (0.25, 4.0)
@@ -26,10 +27,6 @@ _HOP_HZ: Final = (4.0, 40.0)
 _SUSPENSION: Final = (0.01, 1.5)
 """Damping ratio of the body on its springs."""
 _NOISE_UG: Final = (0.5, 5000.0)
-_FAR: Final = 2.0
-"""Factor beyond a range at which a value is taken to be wrong, not only unusual."""
-_MAX_BRIDGES: Final = 50
-"""Largest number of bridges with warnings: a fleet's site file has thousands."""
 
 _STIFFNESS: Final = (("kN/m", 1e3), ("N/m times 1000", 1e-3))
 _TYRE_OVER_SPRING: Final = (0.9, 25.0)
@@ -39,8 +36,6 @@ _AXLE_OVER_REAR: Final = (0.3, 1.4)
 _LOADS_REVERSED: Final = (2.0, 0.4)
 """Least factor between the loads and what springs, tyres and axles are made for, and the largest
 share of it, in logarithms, that is left with the loads swapped."""
-_GIVEN_OVER_IMPLIED: Final = (0.6, 1.7)
-"""EI by the given first frequency over the nominal one."""
 _RATIO_AS_ALPHA: Final = (0.003, 0.1)
 """Values of alpha in 1/s that are damping ratios of bridges."""
 _IDLE: Final = 0.25
@@ -63,50 +58,18 @@ class Slip(NamedTuple):
     units: tuple[tuple[str, float], ...]
 
 
-class ImpliedQuantity(NamedTuple):
-    """A quantity that a site file implies, and its usual range."""
-
-    name: str
-    text: str
-    value: float
-    low: float
-    high: float
-    unit: str
-    meant: str
-    """Probable intention; empty where there is none to suggest or the value is usual."""
-    is_certain: bool = True
-    """Whether a value far out of its range cannot be right."""
-
-    @property
-    def is_unusual(self) -> bool:
-        """Whether it is out of its range."""
-        return not self.low <= self.value <= self.high
-
-    @property
-    def is_far(self) -> bool:
-        """Whether it is far out of its range."""
-        return self.is_certain and (self.value < self.low / _FAR or self.value > self.high * _FAR)
-
-    @property
-    def advice(self) -> str:
-        """Sentence that names the usual range, and what was probably meant."""
-        most = f" to {self.high:.3g}" if self.high < math.inf else " at least"
-        usual = f"typical is {self.low:.3g}{most} {self.unit}".rstrip()
-        return f"{usual}: {self.meant}" if self.meant else f"{usual}: check units and values"
-
-
 def implied_by(site: Site, vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     """Yield what a site file implies of a truck, its sensors and the bridges under it."""
     yield from of_truck(vehicle)
     yield from of_sensors(site.sensor, vehicle)
-    for bridge in site.bridges[:_MAX_BRIDGES]:
+    for bridge in site.bridges[:MAX_BRIDGES]:
         yield from of_bridge(bridge, vehicle)
 
 
 def warnings_of(site: Site, toml_text: str = "") -> list[str]:
     """Return a line for everything that is unusual in a site, and in its text if it is given."""
     found = [one for vehicle in site.vehicles for one in implied_by(site, vehicle)]
-    found += of_frequencies(toml_text)
+    found += given_frequencies(toml_text)
     return list(dict.fromkeys(f"{one.text}: {one.advice}" for one in found if one.is_unusual))
 
 
@@ -157,29 +120,6 @@ def of_truck(vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     yield from _odd(_loads(vehicle))
     yield from _odd(_pairs(vehicle, loads))
     yield from _odd(_tyres(vehicle))
-
-
-def of_frequencies(toml_text: str) -> Iterator[ImpliedQuantity]:
-    """Yield bridges of a site file whose EI contradicts the given first frequency.
-
-    Raise InputError if the text is not TOML.
-    """
-    tables = parse_toml(toml_text, "the site file").get("bridge", [])
-    for table in (tables if isinstance(tables, list) else [tables])[:_MAX_BRIDGES]:
-        given_hz, implied_hz = table.get("first_frequency_hz"), implied_first_frequency_hz(table)
-        if given_hz is None or implied_hz is None:
-            continue
-        ratio = (given_hz / implied_hz) ** 2
-        rigidity = table["flexural_rigidity_nm2"]
-        text = (
-            f"{table.get('id')}: first_frequency_hz {given_hz:g}, EI, mass and span give "
-            f"{implied_hz:.3g} Hz; EI by frequency over flexural_rigidity_nm2 {ratio:.2g}"
-        )
-        meant = f"flexural_rigidity_nm2 is {rigidity:g}: {rigidity * ratio:.3g} for {given_hz:g} Hz"
-        low, high = _GIVEN_OVER_IMPLIED
-        yield ImpliedQuantity(
-            "given_frequency", text, ratio, low, high, "", meant, is_certain=False
-        )
 
 
 def _loads(vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
@@ -275,7 +215,7 @@ def of_bridge(bridge: Bridge, vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     span, rigidity, mass = bridge.uniform()
     per_element = bridge.flexural_rigidity_per_element_nm2 is not None
     key = "flexural_rigidity_" + ("per_element_nm2" if per_element else "nm2")
-    first_hz = math.pi / (2.0 * span**2) * math.sqrt(rigidity / mass)
+    first_hz = first_frequency_hz(bridge)
     usual = 100.0 / span
     slips: tuple[Slip, ...] = (
         Slip(key, rigidity, _power(first_hz, 0.5), _RIGIDITY),

@@ -11,7 +11,7 @@ from pre_core.diagnostics.noise_floor import NoiseSegment
 from pre_core.physics.simulate import Motion
 from schemas.site import Site, Vehicle
 from schemas.site_file import parse_site, read_site_text
-from schemas.site_usual import of_frequencies
+from schemas.site_frequency import given_frequencies
 from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.common.progress import Offset, no_progress
@@ -111,7 +111,7 @@ def _text_of(path: Path) -> SiteText:
 def _of_site(text: SiteText) -> CheckReport:
     site = parse_site(*text)
     found = [finding for vehicle in site.vehicles for finding in findings_of_site(site, vehicle)]
-    found += map(finding_of_implied, of_frequencies(text.toml))
+    found += map(finding_of_implied, given_frequencies(text.toml))
     return CheckReport(text.name, tuple(dict.fromkeys(found)), is_run=False)
 
 

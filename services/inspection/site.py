@@ -4,7 +4,8 @@ from collections.abc import Iterator
 from typing import Final
 
 from schemas.site import Bridge, Site, Vehicle
-from schemas.site_usual import ImpliedQuantity, implied_by
+from schemas.site_implied import ImpliedQuantity
+from schemas.site_usual import implied_by
 from schemas.site_vehicle import axle_loads_kg
 from services.finding.placed import densities_ug_per_rthz, rates_hz, sensors_in_words
 from services.identification.checks import ALIKE_LOADS

@@ -7,6 +7,7 @@ import pytest
 
 from schemas.errors import InputError
 from schemas.site_file import load_site, parse_site
+from schemas.site_frequency import first_frequency_hz, given_frequencies
 from schemas.site_usual import implied_by, warnings_of
 
 ROOT = Path(__file__).parents[3]
@@ -193,6 +194,47 @@ def test_rigidity_that_contradicts_the_first_frequency_is_named(
     (line,) = lines
     assert "flexural_rigidity_nm2" in line
     assert "1.56e+10 for 3.29 Hz" in line
+
+
+@pytest.mark.parametrize(
+    ("given_hz", "state"),
+    [
+        (7.1, "ok"),
+        (6.2, "ok"),
+        (5.9, "open"),
+        (5.1, "wrong"),  # restraint of bearings only raises a frequency
+        (2.4, "wrong"),
+        (9.0, "open"),
+        (13.5, "open"),
+        (20.0, "wrong"),  # both ends clamped give 11.4 Hz
+    ],
+)
+def test_first_frequency_of_two_spans_is_compared_with_ei(given_hz: float, state: str) -> None:
+    """Two spans of 14 m have the frequency of one: 7.32 Hz."""
+    lines = by_frequency(given_hz, 7.5e9).split("\n")
+    lines.insert(lines.index("[bridge]") + 1, "interior_supports_m = [15.0]")
+    text = (
+        "\n".join(lines)
+        .replace("elements = 7", "elements = 6")
+        .replace("mass_per_length_kg_per_m = 4400.0", "mass_per_length_kg_per_m = 6829.4")
+    )
+    (found,) = given_frequencies(text)
+    assert f"first_frequency_hz {given_hz:g}, EI, mass and spans give 7.32 Hz " in found.text
+    assert found.text.endswith("; damping_ratio 0.02")
+    assert ("wrong" if found.is_far else "open" if found.is_unusual else "ok") == state
+    fitting = 7.5e9 * (given_hz / 7.3166) ** 2
+    assert f"flexural_rigidity_nm2 is 7.5e+09: {fitting:.3g} for {given_hz:g} Hz" in found.advice
+    clamped = f"{fitting / 2.441:.3g} with clamped ends"
+    assert (clamped in found.advice) == (given_hz > 7.32)
+    assert bool(warnings_of(parse_site(text, "site.toml"), text)) == (state != "ok")
+
+
+def test_clamped_ends_raise_the_first_frequency_as_in_the_textbook() -> None:
+    bridge = SITE.bridges[0]
+    free_hz = first_frequency_hz(bridge)
+    assert first_frequency_hz(bridge, is_clamped=True) / free_hz == pytest.approx(
+        (4.730041 / math.pi) ** 2, rel=1e-5
+    )
 
 
 def test_damping_ratio_for_alpha_is_named_with_the_probable_value() -> None:
