@@ -36,6 +36,8 @@ class HowToRead(NamedTuple):
     zone: str | None = None
     start: str | None = None
     accepts_guesses: bool = False
+    is_draft: bool = False
+    """Whether the drive is only shown and mapped, with a missing zone left open."""
     reading: Steps = no_step_progress
     """Callback for the number of files read."""
 
@@ -85,7 +87,7 @@ def understood_runs(
         else:
             return Understood(runs, notes_of(runs, site), ImportMap())
     declared = next(iter(rates_hz(site.sensor, vehicle).values()))
-    target = Target(site, vehicle, declared, how.zone, how.start)
+    target = Target(site, vehicle, declared, how.zone, how.start, how.is_draft)
     try:
         found = understand(sources, how.mapping or ImportMap(), target)
         for run in found.runs:

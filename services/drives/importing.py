@@ -83,7 +83,7 @@ def import_command(
 
 def understood_drive(asked: ImportOptions) -> Understood:
     """Return a drive of CSV files as it is read, with all guesses; nothing is written."""
-    how = _how_to_read(asked, no_step_progress)
+    how = _how_to_read(asked, no_step_progress)._replace(is_draft=True)
     site = load_site(asked.site)
     vehicle_id = vehicle_of(site, str(asked.site), asked.vehicle)
     return understood_runs(asked.sources, site, vehicle_id, how)
@@ -91,7 +91,7 @@ def understood_drive(asked: ImportOptions) -> Understood:
 
 def _how_to_read(asked: ImportOptions, reading: Steps) -> HowToRead:
     mapping = None if asked.map is None else load_map(asked.map)
-    return HowToRead(mapping, asked.zone, asked.start, asked.yes, reading)
+    return HowToRead(mapping, asked.zone, asked.start, asked.yes, reading=reading)
 
 
 def _import_ros2(source: Path, drive: _Drive, output: Path, *, force: bool) -> str:

@@ -12,7 +12,7 @@ from services.common.errors import InputError
 from services.drives.runs import Run
 from services.drives.tables import judged
 from services.drives.tables.clocks import clock_note
-from services.drives.tables.parts import Guess
+from services.drives.tables.guesses import Guess
 from services.drives.tables.stamps import LATEST_UNIX_S
 from services.drives.tables.units import SPEED
 from services.finding.placed import middle_sensor

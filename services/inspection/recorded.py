@@ -15,6 +15,7 @@ from services.common.errors import InputError
 from services.common.progress import Offset, no_progress
 from services.drives.importing import normalised_runs, vehicle_of
 from services.drives.runs import run_to_messages
+from services.drives.tables.guesses import check_folder_hint
 from services.finding.drive import DriveMessages, drives_of
 from services.finding.streams import Boot, Fixes, Samples, boot_of
 from services.recordings.recording import read_messages
@@ -78,7 +79,10 @@ def recorded_runs(
 def _of_folder(folder: Path, site: Site, site_name: str) -> Iterator[Message]:
     """Yield the messages as `driveby import` would read them; the check judges the rates."""
     vehicle_id = vehicle_of(site, site_name, None)
-    runs = normalised_runs([folder], site, site_name, vehicle_id, checks_rate=False)
+    try:
+        runs = normalised_runs([folder], site, site_name, vehicle_id, checks_rate=False)
+    except InputError as error:
+        raise InputError(check_folder_hint(str(error), folder)) from error
     return run_to_messages(runs, site, _REALM, vehicle_id)
 
 

@@ -28,7 +28,9 @@ def _preview(asked: ImportOptions) -> int:
         print(asked.picture)
     if asked.write_map is not None:
         write_atomically(asked.write_map, map_text(found.mapping))
-        print(f"{asked.write_map}: check it, then driveby import --map {asked.write_map}")
+        has_hole = any(one.kind == "open" for one in found.guesses)
+        todo = "fill in the zone and check it" if has_hole else "check it"
+        print(f"{asked.write_map}: {todo}, then driveby import --map {asked.write_map}")
     return 0
 
 

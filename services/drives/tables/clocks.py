@@ -11,6 +11,7 @@ from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.common.language import utc_day
 from services.drives.tables.findings import Findings, Target
+from services.drives.tables.mapping import OPEN_ZONE
 from services.drives.tables.parts import TablePart
 from services.drives.tables.stamps import start_of, to_utc, zone_of
 
@@ -19,6 +20,7 @@ _MAX_QUARTERS: Final = 4 * 14
 _LONG_S: Final = 3600.0
 """First time beyond which a count from the start is not that of a drive."""
 _GPS_LESS_UTC_S: Final = 18.0
+_ORDERS: Final = {"ymd": "year, month, day", "dmy": "day, month, year", "mdy": "month, day, year"}
 _EPOCHS_S: Final = {"gps_s": 315_964_782.0, "labview_s": 2_082_844_800.0}
 
 
@@ -35,13 +37,17 @@ def begins(
         if part.times.is_relative:
             add_s[part.name] += _start(part, run, runs, target, found, _day_of(zoned))
         elif part.times.needs_zone and target.zone is None and given_time.zone is None:
-            if not any(_overlap(part, other) for other in zoned):
+            is_known = any(_overlap(part, other) for other in zoned)
+            if not is_known and not target.is_draft:
                 raise InputError(
                     f"{where}: times have no zone: give --zone UTC, --zone +01:00 or --zone "
                     "Europe/Berlin (in a map: zone in [file.time])"
                 )
-            found.time(part, zone="UTC")
-            found.guess(part, "times without a zone are UTC, as the other file's are")
+            found.time(part, zone="UTC" if is_known else OPEN_ZONE)
+            if is_known:
+                found.guess(part, "times without a zone are UTC, as the other file's are")
+            else:
+                found.guess(part, "times have no zone: shown as UTC, give --zone", "open")
         elif part.times.needs_zone:  # days of a spreadsheet
             first_s = np.array([np.nanmin(part.times.time_s)])
             zone = zone_of(given_time.zone or target.zone or "", where)
@@ -52,7 +58,17 @@ def begins(
             "date", "excel_days",
         ):  # fmt: skip
             found.time(part, zone=target.zone)
+        if part.times.format == "date" and part.times.order is not None:
+            found.guess(part, _dates_in_words(part, target), "form")
     return add_s
+
+
+def _dates_in_words(part: TablePart, target: Target) -> str:
+    order = _ORDERS[part.times.order or "ymd"]
+    zone = part.given.time.zone or target.zone
+    if zone is not None:
+        return f"dates are {order}, in {zone} where they name no zone"
+    return f"dates are {order}" + ("" if part.times.needs_zone else ", in the zone that they name")
 
 
 def _day_of(parts: Sequence[TablePart]) -> str | None:

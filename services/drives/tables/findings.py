@@ -1,11 +1,12 @@
 """Input of the reading of tables, and its findings for one run, file by file."""
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from schemas.site import Site, Vehicle
+from services.drives.tables.guesses import Guess, GuessKind
 from services.drives.tables.mapping import ColumnMap, FileMap
-from services.drives.tables.parts import Guess, TablePart
+from services.drives.tables.parts import TablePart
 
 
 class Target(NamedTuple):
@@ -16,6 +17,8 @@ class Target(NamedTuple):
     declared_hz: float
     zone: str | None = None
     start: str | None = None
+    is_draft: bool = False
+    """Whether a missing zone is left open in the map, and times are read as UTC."""
 
 
 class Findings:
@@ -30,9 +33,7 @@ class Findings:
             part.name: dict(part.found.columns) for part in parts
         }
 
-    def guess(
-        self, part: TablePart, text: str, kind: Literal["form", "lost", "converts"] = "converts"
-    ) -> None:
+    def guess(self, part: TablePart, text: str, kind: GuessKind = "converts") -> None:
         """Record a guess about a file."""
         self._guesses.append(Guess(f"{part.name}: {text}", kind))
 

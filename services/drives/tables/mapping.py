@@ -25,6 +25,8 @@ Order = Literal["ymd", "dmy", "mdy"]
 ColumnName = Annotated[int, Strict(), Field(ge=1, le=1000)] | Annotated[str, Field(max_length=200)]
 Line = Annotated[int, Strict(), Field(ge=0, le=100_000)]
 
+OPEN_ZONE: Final = ""
+"""Zone of times in a map that was written before it was known."""
 HEAD: Final = "# How driveby import reads these files (--map)."
 POSITION_COLUMNS: Final = ("latitude_deg", "longitude_deg", "altitude_m", "speed_mps")
 
@@ -135,11 +137,17 @@ def map_text(found: ImportMap) -> str:
         lines += [f"{key} = {_value(value)}" for key, value in values.items()]
         if time:
             lines.append("[file.time]")
-            lines += [f"{key} = {_value(value)}" for key, value in time.items()]
+            lines += [_time_line(key, value) for key, value in time.items()]
         if columns:
             lines.append("[file.columns]")
             lines += [f"{key} = {_value(value)}" for key, value in columns.items()]
     return "\n".join(lines) + "\n"
+
+
+def _time_line(key: str, value: Any) -> str:
+    if (key, value) == ("zone", OPEN_ZONE):
+        return '# zone = "Europe/Berlin"  # missing: fill in, or UTC, or +01:00'
+    return f"{key} = {_value(value)}"
 
 
 def _value(value: Any) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from datetime import tzinfo
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from services.drives.tables.dates import (
     times_of_day,
 )
 from services.drives.tables.dialect import Dialect, Sheet, described, is_number
+from services.drives.tables.guesses import Guess
 from services.drives.tables.mapping import (
     POSITION_COLUMNS,
     ColumnMap,
@@ -37,14 +38,6 @@ _SECONDS_OF_WEEK: Final = {"tow", "itow", "sow", "gpstow", "gpssow"}
 _LONGEST_UPTIME_S: Final = 1e8
 _PLAIN: Final = ("utf-8", ",", ".", 1, 0, 2)
 """Dialect of the contract."""
-
-
-class Guess(NamedTuple):
-    """An interpretation that the files do not state explicitly."""
-
-    text: str
-    kind: Literal["form", "lost", "converts"]
-    """Effect of the guess: form of the text, data left out, or changed numbers to be confirmed."""
 
 
 class TablePart(NamedTuple):

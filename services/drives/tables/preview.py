@@ -10,17 +10,18 @@ import numpy as np
 from services.common.arrays import Floats
 from services.common.naming import count_of
 from services.drives.runs import Run, grid_index
+from services.drives.tables.guesses import grouped
 from services.drives.tables.reading import Understood
 
 _ROWS: Final = 3
 _BARS: Final = "▁▂▃▄▅▆▇█"
-_KINDS: Final = {"converts": "guess", "lost": "note", "form": "form"}
+_KINDS: Final = {"converts": "guess", "lost": "note", "open": "open", "form": "form"}
 _GAP: Final = 1
 
 
 def preview_lines(found: Understood, width: int) -> list[str]:
     """Return the lines printed before anything is written, each at most `width` long."""
-    lines = [f"{_KINDS[one.kind]}: {one.text}" for one in found.guesses]
+    lines = [f"{_KINDS[one.kind]}: {one.text}" for one in grouped(found.guesses)]
     if not lines:
         lines = ["the files are in the form of the contract"]
     for run in found.runs:

@@ -19,8 +19,9 @@ from services.drives.tables.accelerations import as_declared, scaled
 from services.drives.tables.clocks import begins, check_overlap
 from services.drives.tables.dialect import read_sheet
 from services.drives.tables.findings import Findings, Target
+from services.drives.tables.guesses import Guess, conversions
 from services.drives.tables.mapping import FileMap, ImportMap
-from services.drives.tables.parts import Guess, TablePart, read_part
+from services.drives.tables.parts import TablePart, read_part
 from services.drives.tables.positions import track
 from services.drives.tables.rows import fixes, samples
 from services.drives.tables.stamps import zone_of
@@ -38,7 +39,7 @@ class Understood(NamedTuple):
 
     def conversions(self) -> list[str]:
         """Return the guesses that are to be confirmed."""
-        return list(dict.fromkeys(g.text for g in self.guesses if g.kind == "converts"))
+        return conversions(self.guesses)
 
 
 def understand(sources: Sequence[Path], given: ImportMap, target: Target) -> Understood:

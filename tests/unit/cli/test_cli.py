@@ -9,6 +9,7 @@ import resource
 import subprocess
 import sys
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -249,7 +250,40 @@ def test_import_previews_writes_a_map_and_reads_by_it(
     other = drive.parent / "other.toml"
     other.write_text(site.read_text())
     assert "only a map of an import" in refused(capsys, *arguments, "--write-map", other)
-    assert "is read by guesses" in refused(capsys, "check", drive)
+    line = refused(capsys, "check", drive)
+    assert "is read by guesses" in line
+    assert f"driveby check has none of these options: driveby import {drive} --site " in line
+
+
+def test_map_of_an_import_without_a_zone_leaves_the_zone_open(
+    capsys: pytest.CaptureFixture[str], drive: Path
+) -> None:
+    for path in drive.glob("*.csv"):
+        head, *rows = path.read_text().splitlines()
+        cells = [row.split(",", 1) for row in rows]
+        dated = [
+            f"{datetime.fromtimestamp(float(s), UTC):%d.%m.%Y %H:%M:%S.%f},{rest}"
+            for s, rest in cells
+        ]
+        path.write_text("\n".join([head, *dated]) + "\n")
+    site, output, named = drive / "site.toml", drive.parent / "out.mcap", drive.parent / "map.toml"
+    arguments = ("import", drive, "--site", site)
+    line = refused(capsys, "check", drive)
+    assert "times have no zone: give --zone UTC" in line
+    assert "driveby check has none of these options" in line
+    code, out, _ = run(capsys, *arguments, "--preview", "--write-map", named)
+    assert code == 0
+    assert "open: accel_00.csv and 1 more: times have no zone: shown as UTC, give --zone" in out
+    assert "form: accel_00.csv and 1 more: dates are day, month, year\n" in out
+    assert f"{named}: fill in the zone and check it, then driveby import --map {named}" in out
+    hole = '# zone = "Europe/Berlin"  # missing: fill in, or UTC, or +01:00'
+    assert named.read_text().count(hole) == 2
+    assert "times have no zone" in refused(capsys, *arguments, "--map", named, "-o", output)
+    named.write_text(named.read_text().replace(hole, 'zone = "UTC"'))
+    assert run(capsys, *arguments, "--map", named, "-o", output)[0] == 0
+    _, out, _ = run(capsys, *arguments, "--preview", "--zone", "UTC")
+    words = "dates are day, month, year, in UTC where they name no zone"
+    assert f"form: accel_00.csv and 1 more: {words}" in out
 
 
 def test_the_vehicle_must_be_chosen_where_there_are_several(

@@ -18,7 +18,8 @@ from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.drives.csv_runs import AS_WRITTEN, HowToRead, csv_runs, understood_runs
 from services.drives.runs import Run
-from services.drives.tables.mapping import load_map, map_text
+from services.drives.tables.guesses import Guess, grouped
+from services.drives.tables.mapping import ImportMap, load_map, map_text
 from services.drives.tables.preview import preview_lines
 from services.drives.tables.reading import Understood
 
@@ -1074,3 +1075,20 @@ def test_strange_drive_is_noted_and_read(
     assert any(words in guess.text for guess in found.guesses)
     plain = understood_runs([written(tmp_path / "plain", pair())], site_of(), "truck-x")
     assert plain.guesses == []
+
+
+def test_equal_guesses_of_several_files_are_one_and_units_come_first() -> None:
+    units = "accelerations are in g"
+    guesses = [
+        *(Guess(f"P_{k}.csv: by their names latitude_deg is column 2", "converts") for k in (1, 2)),
+        *(Guess(f"A_{k}.csv: {units}", "converts") for k in (1, 2, 3)),
+        Guess("P_1.csv: no altitude", "form"),
+    ]
+    assert [one.text.partition(": ")[0] for one in grouped(guesses)] == [
+        "P_1.csv and 1 more",
+        "A_1.csv and 2 more",
+        "P_1.csv",
+    ]
+    found = Understood([], guesses, ImportMap()).conversions()
+    assert found[0] == f"A_1.csv and 2 more: {units}"
+    assert len(found) == 2
