@@ -14,6 +14,7 @@ from services.inspection.site import (
     noise_declared,
     sampling,
 )
+from services.planning.alternatives import EQUAL_TYRES
 from services.planning.crossings import axles_of, has_declared_offset
 from services.planning.survey import MAX_CROSSINGS, PlanForecast, SurveyForecast
 
@@ -104,15 +105,21 @@ def _of_the_others(found: SurveyForecast) -> str:
     else:
         verb = "detects" if best.needed_middle == 1 else "detect"
         gain = f"then {count_of(best.needed_middle, 'crossing')} {verb} it, and {_ends(best)}"
-    sentence = f"What helps most: {best.plan.label}; {gain}."
+    sentence = f"What helps most: {_change(best)}; {gain}."
     if len(better) > 1:
         next_best = better[1]
         smallest = next_best.expected.smallest_loss[next_best.middle]
         sentence += (
-            f" Next best: {next_best.plan.label} ({found.question.crossings} crossings then detect "
+            f" Next best: {_change(next_best)} ({found.question.crossings} crossings then detect "
             f"a loss of {percent(smallest)})."
         )
     return sentence
+
+
+def _change(one: PlanForecast) -> str:
+    if one.plan.name == EQUAL_TYRES:
+        return f"{EQUAL_TYRES}, on equal tracks to a centimetre"
+    return one.plan.label
 
 
 def _helps(one: PlanForecast, planned: PlanForecast) -> bool:

@@ -22,7 +22,9 @@ _ELEMENTS: Final = (5, 3)
 _MOVED: Final = 0.12
 """Shift of the load to the heavier axle, relative to the wheelbase, where both are alike."""
 
-
+_UNEQUAL: Final = ("tyre_contact_length_m", "track_m")
+"""Pairs of a site file that equal single tyres have in common, besides the width."""
+EQUAL_TYRES: Final = "equal single tyres on both axles"
 _OTHER_WAY = "half of the runs the other way"
 
 
@@ -100,15 +102,16 @@ def _other_trucks(site: Site) -> Iterator[tuple[str, Site]]:
             yield f"a lorry of two axles, {name}", _with_vehicle(site, usual_lorry(tyres))
         return
     if not is_equal or front.twin_distance_m > 0.0:
-        yield "equal single tyres on both axles", with_tyres(site, "single")
+        yield EQUAL_TYRES, with_tyres(site, "single")
     if not bridge.interior_supports_m and len(set(bridge.lengths_m)) == 1:
         yield "a truck with an equalised tandem", _with_vehicle(site, usual_tandem(noise))
 
 
 def with_tyres(site: Site, behind: str) -> Site:
-    """Return a site with single tyres in front, and like single ones or twins `behind`.
+    """Return a site with single tyres in front, and equal single ones or twins `behind`.
 
-    Both axles of a tandem get the same tyres and one track.
+    Single tyres behind have the front axle's width, contact length and track. Both axles of a
+    tandem get the same tyres.
     """
     vehicle = site.vehicles[0]
     if vehicle.tandem is not None:
@@ -131,6 +134,10 @@ def with_tyres(site: Site, behind: str) -> Site:
         "twin_tyre_distance_m": (0.0, 0.33 if twin else 0.0),
         "tyre_width_m": (width, 0.22 if twin else width),
     }
+    for key in () if twin else _UNEQUAL:
+        declared = getattr(vehicle, key)
+        if declared is not None:
+            changed[key] = (declared[0], declared[0])
     return _with_vehicle(site, vehicle.model_copy(update=changed))
 
 

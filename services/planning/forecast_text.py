@@ -99,6 +99,7 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     yield "stiffness and of EI at midspan; seen, smallest: at midspan; needed, ends:"
     yield f"crossings until the loss is detected with {wanted} probability at midspan; at both"
     yield f"ends (elsewhere between the two numbers); –: more than {MAX_CROSSINGS};"
+    yield "equal single tyres: on equal tracks, to a centimetre;"
     yield "at … t: only if legal axle and total loads allow it;"
     yield "in the other direction: in the opposite lane;"
     yield "… elements: fewer, longer ones"

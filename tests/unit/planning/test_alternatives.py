@@ -34,6 +34,17 @@ def test_single_tyres_are_proposed_only_where_there_are_others() -> None:
     assert name in named(with_tyres(paper_site(), "twin"))
 
 
+def test_equal_single_tyres_are_planned_on_equal_tracks() -> None:
+    unlike = {"track_m": (2.05, 1.83), "tyre_contact_length_m": (0.2, 0.25)}
+    vehicle = paper_site().vehicles[0].model_copy(update=unlike)
+    site = paper_site().model_copy(update={"vehicles": (vehicle,)})
+    single = named(site)["equal single tyres on both axles"].site.vehicles[0]
+    assert single.track_m == (2.05, 2.05)
+    front, rear = axles_of(single)
+    assert rear._replace(offset_m=front.offset_m) == front
+    assert with_tyres(site, "twin").vehicles[0].track_m == (2.05, 1.83)
+
+
 def test_other_loads_change_nothing_but_the_mass() -> None:
     site = paper_site()
     plans = [plan for name, plan in named(site).items() if name.startswith("half of the runs at")]
