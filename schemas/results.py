@@ -342,7 +342,7 @@ def unresolved_note(crossing: CrossingResult) -> str | None:
         return None
     level = crossing.derived.ei_level
     spread = 100.0 * level.std / level.mean
-    which = "elements" if open_ones == len(elements) else f"{open_ones} of {len(elements)} elements"
+    which = f"{open_ones} of {len(elements)} elements"
     return f"overall stiffness {level.mean:.2f} of nominal ± {spread:.0f} %, {which} not resolved"
 
 

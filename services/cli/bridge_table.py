@@ -96,7 +96,8 @@ def _of_state(state: BridgeResult) -> Iterator[str]:
         wander = "" if track.wander_m is None else f", lateral wander {track.wander_m:.2f} m"
         yield (
             f"wheel-path group of {track.vehicle}, {track.direction.replace('_', ' ')}{wander}: "
-            f"{100.0 * track.common_share:.0f} % of the profile mismatch is common to all runs"
+            f"{100.0 * track.common_share:.0f} % of the profile mismatch is common to all runs, "
+            "so more runs there average out only the rest"
         )
 
 
@@ -123,7 +124,7 @@ def print_elements(
         table.add_column("95 % interval", justify="right")
     percents = list(next(iter(losses.values()))) if losses else []
     if losses:
-        table.add_column(f"lost {'/'.join(percents)}", justify="right")
+        table.add_column(f"probability\nlost {'/'.join(percents)}", justify="right")
     start = 0.0
     for number, (length, sound) in enumerate(
         zip(bridge.lengths_m, bridge.nominal_flexural_rigidity_nm2, strict=True), start=1

@@ -7,7 +7,7 @@ is used, to make elements of different design comparable.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -22,6 +22,8 @@ CLEAR_LOSS = 0.1
 IMPLAUSIBLE_GAIN = 0.2
 """Gain above which no whole 95 % interval of an element is plausible: from summer to winter,
 30 K, the stiffness of concrete and asphalt rises by some 12 %."""
+Stated = Literal["unresolved", "visible"]
+"""A sentence that may be left out: on unresolved elements, on the smallest visible loss."""
 _FEWEST_ELEMENTS = 3
 """Fewest comparable elements: of two, the undamaged one cannot be identified."""
 
@@ -234,21 +236,24 @@ def describe_comparison(
     unresolved: Set[int] = frozenset(),
     level: ElementState | None = None,
     language: Language = ENGLISH,
+    without: Collection[Stated] = (),
 ) -> list[str]:
     """Return sentences on the comparison; of unresolved elements they state only that.
 
-    `unresolved` are their numbers; with them the `level` of the bridge is stated.
+    `unresolved` are their numbers; with them the `level` of the bridge is stated. The caller states
+    `without` itself.
     """
     if found is None or not unresolved:
-        return sentences(found, language)
+        return sentences(found, language, without)
     wordings = describe_clear_elements(found, language)
     others = ambiguous_neighbours(found, unresolved)
     if others:
         either = f" {language.text('or')} ".join(map(str, others))
-        wordings.append(language.text("may_be_beside", numbers=either))
-    wordings.append(_not_resolved(len(found.elements), unresolved, language))
+        wordings.append(language.choice("may_be_beside", len(others), numbers=either))
+    if "unresolved" not in without:
+        wordings.append(_not_resolved(len(found.elements), unresolved, language))
     resolved = tuple(e for e in found.rest if e.number not in unresolved)
-    if resolved:
+    if resolved and "visible" not in without:
         wordings.append(language.text("rest.resolved", loss=_smallest_seen(resolved)))
     if level is not None:
         std = 100.0 * level.std / level.mean
@@ -270,7 +275,9 @@ def _not_resolved(count: int, unresolved: Set[int], language: Language) -> str:
     return language.choice("unresolved", len(unresolved), **values)
 
 
-def sentences(found: Comparison | None, language: Language = ENGLISH) -> list[str]:
+def sentences(
+    found: Comparison | None, language: Language = ENGLISH, without: Collection[Stated] = ()
+) -> list[str]:
     """Return sentences on the comparison for readers who know the bridge and not the method."""
     if found is None:
         return [language.text("not_comparable")]
@@ -278,9 +285,11 @@ def sentences(found: Comparison | None, language: Language = ENGLISH) -> list[st
     wordings += [_change("stiffer", found, e, language) for e in found.stiff]
     if found.rest:
         farthest = max(abs(1.0 - e.ratio) for e in found.rest)
-        values = {"within": max(1, per_cent_up(farthest)), "loss": _smallest_seen(found.rest)}
+        within = max(1, per_cent_up(farthest))
         which = "rest" if wordings else "all"
-        wordings.append(language.text(f"{which}.{found.reference}", **values))
+        wordings.append(language.text(f"{which}.{found.reference}", within=within))
+        if "visible" not in without:
+            wordings.append(language.text("rest.visible", loss=_smallest_seen(found.rest)))
     return wordings
 
 

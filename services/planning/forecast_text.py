@@ -85,16 +85,16 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
         f"overall stiffness: ± {_percent(planned.once.level_std)} after 1 crossing, "
         f"± {_percent(planned.expected.level_std)} after {question.crossings}"
     )
-    yield "±: standard deviation of EI; near 55 % it is the prior's; seen: probability that"
-    yield "the loss is detected against the nominal value; vs others: against the others;"
-    yield f"smallest: loss that is detected with {percent(DETECTION_PROBABILITY)} probability"
+    yield "±: standard deviation of EI; near 55 % the measurement adds nothing; seen:"
+    yield "probability that the loss is detected against the nominal value; vs others:"
+    wanted = percent(DETECTION_PROBABILITY)
+    yield f"against the others; smallest: loss that is detected with {wanted} probability"
     yield f"detected: by a one-sided test with {false} false alarms; a report calls an element"
     clear = percent(CLEAR_LOSS)
     yield f"clearly less stiff only if its whole 95 % interval is more than {clear} below"
     yield "the others or the baseline, which takes a larger loss or more crossings"
     yield ""
     yield from _aligned(_comparison(found))
-    wanted = percent(DETECTION_PROBABILITY)
     yield f"after {question.crossings} crossings; overall, mid: standard deviations of the overall"
     yield "stiffness and of EI at midspan; seen, smallest: at midspan; needed, ends:"
     yield f"crossings until the loss is detected with {wanted} probability at midspan; at both"

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from schemas.results import BridgeResult, CrossingResult, Results
+from schemas.results import RESOLVED, BridgeResult, CrossingResult, Results
 from schemas.site import Bridge, Site
 from services.common.errors import InputError
 from services.common.extras import check_extras
@@ -212,12 +212,21 @@ def _one_by_one(
     for weak in view.comparison.weak:
         losses = [1.0 - one.elements[weak.number - 1].ratio for one in found if one is not None]
         if len(losses) >= 2:
-            low, high = 100.0 * min(losses), 100.0 * max(losses)
-            key = "losses.same" if round(low) == round(high) else "losses.range"
-            number, text = len(losses), language.text(key, low=low, high=high)
+            number, text = len(losses), _range_of(losses, language)
             elements.append(language.text("losses.element", element=weak.number, losses=text))
     if elements:
         yield language.text("finding.scatter", number=number, elements=language.listed(elements))
+
+
+def _range_of(losses: Sequence[float], language: Language) -> str:
+    """Return the losses of an element in words; a negative one is a gain."""
+    low, high = 100.0 * min(losses), 100.0 * max(losses)
+    if round(high) < 0:
+        return language.text("losses.gain", loss=-high, gain=-low)
+    if round(low) < 0:
+        return language.text("losses.mixed", gain=-low, high=high)
+    key = "losses.same" if round(low) == round(high) else "losses.range"
+    return language.text(key, low=low, high=high)
 
 
 def _finding(
@@ -228,7 +237,8 @@ def _finding(
 ) -> BridgeFinding:
     if view.estimate is None:
         return _no_finding(crossings, language)
-    wording = (*describe_bridge(view, language), *_one_by_one(view, crossings, baseline, language))
+    single = tuple(_one_by_one(view, crossings, baseline, language))
+    wording = (*describe_bridge(view, language), *single)
     if view.is_doubtful:
         why = dict.fromkeys(_reasons_of_state(view, crossings, language))
         because = (language.text("finding.reasons", reasons=" ".join(why)),) if why else ()
@@ -249,7 +259,13 @@ def _finding(
     if missed is None:
         kind = "open" if but else "sound"
         return BridgeFinding(kind, language.text("finding.none") + but, wording)
-    return BridgeFinding("open", missed + but, (*wording, _seen(view.comparison, language)))
+    # The headline names the unresolved elements unless they are most of them.
+    are_named = 2 * len(view.unresolved) <= len(view.comparison.elements)
+    described = describe_bridge(
+        view, language, ("visible", "unresolved") if are_named else ("visible",)
+    )
+    sentences = (*described, *single, _seen(view.comparison, language))
+    return BridgeFinding("open", missed + but, sentences)
 
 
 def _but_implausible(found: Comparison, language: Language) -> str:
@@ -268,7 +284,8 @@ def _why_open(view: BridgeView, found: Comparison, language: Language) -> str | 
         return language.text("finding.open")
     if unresolved:
         numbers = language.listed([str(number) for number in unresolved])
-        return language.choice("finding.partly", len(unresolved), elements=numbers)
+        limit = 100.0 * RESOLVED
+        return language.choice("finding.partly", len(unresolved), elements=numbers, limit=limit)
     if max(one.visible_loss for one in found.elements) > LARGEST_MISSED_LOSS:
         return language.text("finding.coarse", limit=100.0 * LARGEST_MISSED_LOSS)
     return None

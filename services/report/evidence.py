@@ -111,8 +111,14 @@ def _newest_road(crossings: Sequence[CrossingResult], language: Language) -> str
 def _crossings(report: BridgeReport, numbered: Sequence[Numbered], language: Language) -> Html:
     ends = ends_of(report.bridge, language)
     keys = ("number", "time", "truck", "way", "speed", "method", "verdict", "used", "reasons")
+    state = report.view.state
+    left_out = {} if state is None else {c.crossing_id: c.reason for c in state.crossings_left_out}
     rows = []
     for number, crossing in numbered:
+        why = [code.value for code in crossing.reasons]
+        if crossing.crossing_id in left_out and crossing.verdict == "good":
+            reason = left_out[crossing.crossing_id]
+            why.append(language.left_out.get(reason, reason))
         start, end = ends if crossing.direction == "start_to_end" else reversed(ends)
         is_used = crossing.crossing_id in report.view.used
         rows.append(
@@ -124,8 +130,8 @@ def _crossings(report: BridgeReport, numbered: Sequence[Numbered], language: Lan
                 language.number(crossing.speed_m_per_s, ".1f"),
                 crossing.method.replace("_", " "),
                 language.text(crossing.verdict),
-                language.text("crossings.used_cell") if is_used else "",
-                ", ".join(code.value for code in crossing.reasons),
+                language.text("crossings.used_cell" if is_used else "crossings.unused_cell"),
+                ", ".join(why),
             ]
         )
     heads = [language.text(f"crossings.{key}") for key in keys]

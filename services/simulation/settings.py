@@ -77,7 +77,7 @@ class SimulateOptions:
         metavar="M_PER_S",
     )
     direction: str = opt(
-        "direction of travel (default: start_to_end)",
+        "direction of travel, in the same lane (default: start_to_end)",
         default="start_to_end",
         choices=("start_to_end", "end_to_start"),
     )

@@ -49,8 +49,9 @@ _BEFORE, _AFTER = (0.02, 0.42), (0.42, 1.0)
 """Parts of an element that the bars of baseline and state take."""
 _ABOVE_LEGEND_PT = 22.0
 """Distance of the title from the panel, with the legend between them, in points."""
-_SIGNS = {"good": "●", "suspect": "○", "rejected": "×"}
-"""Signs of the verdicts, distinguishable without colour."""
+_SIGNS = {"good": "●", "unused": "○", "suspect": "◇", "rejected": "×"}
+"""Signs of good crossings, of unused good ones, and of the other verdicts, without colour."""
+_MARKERS = {"suspect": "D", "rejected": "X"}
 
 
 def bridge_figure(path: Path, bridge: BridgeView) -> None:
@@ -133,8 +134,11 @@ def _draw_state(axes: Axes, bridge: BridgeView, language: Language) -> float:
     colour = MUTED if bridge.is_doubtful else BAR_EDGE
     label = language.text("figure.interval")
     draw_intervals(axes, places, low, high, colour=colour, label=label)
-    tops = np.maximum(high, _draw_crossings(axes, bridge, places, language))
-    label_bars(axes, places, low, tops, _numbers(bridge, mean, language))
+    dots = _draw_crossings(axes, bridge, places, language)
+    tops = np.maximum(high, dots)
+    # Dots may be anywhere below their highest: a label there would cover them.
+    floor = np.where(dots > 0.0, 0.0, low)
+    label_bars(axes, places, floor, tops, _numbers(bridge, mean, language))
     doubt = "?" if bridge.is_doubtful else ""
     losses = {}
     if _meaning(bridge) == "ratio":  # otherwise the numbers themselves are the changes
@@ -144,9 +148,9 @@ def _draw_state(axes: Axes, bridge: BridgeView, language: Language) -> float:
             )
             for element in weak
         }
-    label_losses(axes, places, low, tops, losses)
+    label_losses(axes, places, floor, tops, losses)
     highest = max(highest, float(tops.max()))
-    return max(1.1 * highest, top_above_labels(axes, low, tops, losses))
+    return max(1.1 * highest, top_above_labels(axes, floor, tops, losses))
 
 
 def _meaning(bridge: BridgeView) -> str:
@@ -192,23 +196,28 @@ def _draw_crossings(
     for place, crossing in zip(np.linspace(-0.4, -0.26, len(drawn)), drawn, strict=True):
         assert crossing.rigidity_nm2 is not None  # noqa: S101 - chosen by that
         values = crossing.rigidity_nm2 / 1e9
-        good = crossing.verdict == "good"
-        label = language.text(f"figure.crossing.{crossing.verdict}")
+        kind = _kind_of(bridge, crossing)
         axes.plot(
             places.centres_m + place * places.lengths_m,
             values,
             linestyle="none",
-            marker="o",
+            marker=_MARKERS.get(kind, "o"),
             markersize=4.2,
             color=INK,
-            markerfacecolor=INK if good else "white",
+            markerfacecolor=INK if kind == "good" else "white",
             markeredgewidth=0.9,
             zorder=9,  # above the plates of all labels: they hid measurements
-            label=None if crossing.verdict in named else label,
+            label=None if kind in named else language.text(f"figure.crossing.{kind}"),
         )
-        named.add(crossing.verdict)
+        named.add(kind)
         highest = np.maximum(highest, values)
     return highest
+
+
+def _kind_of(bridge: BridgeView, crossing: CrossingView) -> str:
+    """Return the verdict of a crossing, `unused` for a good one that the numbers do not include."""
+    is_unused = crossing.verdict == "good" and crossing.crossing_id not in bridge.used
+    return "unused" if is_unused else crossing.verdict
 
 
 def _draw_heading(figure: Figure, bridge: BridgeView, lines: list[str]) -> None:
@@ -276,4 +285,4 @@ def _row(bridge: BridgeView, crossing: CrossingView) -> tuple[str, str]:
         f"{moment:%Y-%m-%d %H:%M} UTC, {crossing.vehicle}, {way}, "
         f"{crossing.speed_m_per_s:.1f} m/s, {crossing.verdict}{used}{why}"
     )
-    return _SIGNS[crossing.verdict], textwrap.shorten(line, width=116, placeholder=" …")
+    return _SIGNS[_kind_of(bridge, crossing)], textwrap.shorten(line, width=116, placeholder=" …")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -91,10 +91,14 @@ def views_of_bridges(
     return views
 
 
-def describe_bridge(view: BridgeView, language: Language = ENGLISH) -> list[str]:
-    """Return sentences on the result, as in the state's own finding."""
+def describe_bridge(
+    view: BridgeView, language: Language = ENGLISH, without: Collection[comparison.Stated] = ()
+) -> list[str]:
+    """Return sentences on the result, as in the state's own finding; the caller has `without`."""
     level = None if view.state is None else view.state.level
-    return comparison.describe_comparison(view.comparison, view.unresolved, level, language)
+    return comparison.describe_comparison(
+        view.comparison, view.unresolved, level, language, without
+    )
 
 
 def origin_of(view: BridgeView) -> str:

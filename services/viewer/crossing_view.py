@@ -234,7 +234,7 @@ def describe_crossing(crossing: CrossingView, found: Comparison | None) -> list[
         return sentences(found)
     return [
         *describe_clear_elements(found),
-        f"Not all elements are resolved: {crossing.resolution}.",
+        f"{crossing.resolution.capitalize()}.",
     ]
 
 

@@ -350,11 +350,11 @@ def simplify_numbers(axes: Axes, language: Language) -> None:
 
 
 def legend_beside_title(axes: Axes) -> None:
-    """Place the legend on the line of the panel's title."""
+    """Place the legend on the line of the title, smaller where it is wider than the panel."""
     handles, _ = axes.get_legend_handles_labels()
     is_long = len(handles) > 4
     if handles:
-        axes.legend(
+        legend = axes.legend(
             loc="lower right",
             bbox_to_anchor=(1.008, 0.985),
             ncols=len(handles),
@@ -364,6 +364,10 @@ def legend_beside_title(axes: Axes) -> None:
             fontsize=8.5 if is_long else 9,
             borderpad=0.0,
         )
+        room = axes.get_window_extent().width / legend.get_window_extent().width
+        if room < 1.0:
+            for text in legend.get_texts():
+                text.set_fontsize(room * text.get_fontsize())
 
 
 def write_centred(axes: Axes, text: str) -> None:

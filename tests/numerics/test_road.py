@@ -51,6 +51,14 @@ def measured_profile(folder: Path) -> Profile:
     return Profile(data[:, 0], data[:, 1])
 
 
+@pytest.mark.parametrize(("name", "most"), [("A", 3.0), ("B", 6.0)])
+def test_iri_at_the_limit_of_a_class_is_that_of_the_glossary(name: str, most: float) -> None:
+    """The limit is twice the geometric mean; the mean of two equal paths has half of one's."""
+    profile = iso_8608_profile(0.0, 2000.0, 0.05, name, 1)
+    at_limit = Profile(profile.x_m, np.sqrt(2.0) * profile.height_m)
+    assert iri_m_per_km(at_limit)[0] == pytest.approx(most, rel=0.05)
+
+
 def test_iri_of_a_measured_profile(
     known_answers: dict[str, Any], reference_folder: Path, agree: Agree
 ) -> None:

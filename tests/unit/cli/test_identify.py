@@ -104,6 +104,16 @@ def simulate_free(site: Site, rng: np.random.Generator) -> Run:
     return Run("free", time, 200.0, channels, track)
 
 
+@pytest.mark.parametrize(("name", "is_usual"), [("a.csv", False), ("a.json", True)])
+def test_unusual_name_of_results_is_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, is_usual: bool
+) -> None:
+    output = tmp_path / name
+    assert cli.main(["identify", str(tmp_path / "none.mcap"), "--json", str(output)]) == 2
+    warning = f"{output}: the file will hold JSON; its usual name ends in .json"
+    assert (warning in capsys.readouterr().err) != is_usual
+
+
 def test_scenario_6_within_one_per_cent(recording: Path) -> None:
     crossing = only(identified(recording))
     assert ratios(crossing) == pytest.approx([1, 1, 1, 0.4, 1, 1, 1], rel=0.01)

@@ -97,8 +97,8 @@ def estimate(crossing: CrossingResult) -> BusMessage:
 
 WEAK_FINDING = (
     "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements "
-    "(95 % interval 57 to 62 %). No other element differs clearly (estimates within 3 %); "
-    "a loss of 16 % would show in each of them."
+    "(95 % interval 57 to 62 %). No other element differs clearly (estimates within 3 %). "
+    "A loss of 16 % in any one of them would have been detected."
 )
 
 
@@ -185,8 +185,8 @@ def a_fleet(site: Site) -> RealmModel:
     drives(watched, "truck-3", ago_s=300.0)
     rng = np.random.default_rng(4)
     quiet = (
-        "No element differs clearly from the others (estimates within {} %); "
-        "a loss of 14 % would show in each of them."
+        "No element differs clearly from the others (estimates within {} %). "
+        "A loss of 14 % in any one of them would have been detected."
     )
     for number, bridge in enumerate(("bridge-02", "bridge-03", "bridge-11", "bridge-07")):
         ratios = 1.0 + 0.012 * rng.standard_normal(7)
@@ -197,7 +197,7 @@ def a_fleet(site: Site) -> RealmModel:
             finding = (
                 "Element 4, 12.9 to 17.1 m: 20 % less stiff than the other elements "
                 "(95 % interval 16 to 24 %). No other element differs clearly (estimates within "
-                "3 %); a loss of 14 % would show in each of them."
+                "3 %). A loss of 14 % in any one of them would have been detected."
             )
         of = {"bridge": bridge, "ratios": ratios}
         who = f"truck-{number % 3 + 1}"

@@ -275,16 +275,16 @@ def with_ends(results: Results, sprung: float, giving: float) -> Results:
 def test_likely_restraint_is_on_the_first_page_unless_declared(site: Site) -> None:
     plain = fused(site, KNOWN)
     text = first_page(reported(site, with_ends(plain, 0.998, 0.95)))
-    assert "integral abutment: the south-west end (probability 99 %)." in text
-    assert "loose bearing: the north-east end (probability 95 %)." in text
+    assert "abutment, is likely at the south-west end (probability 99 %). The" in text
+    assert "loose bearing, is likely at the north-east end (probability 95 %). The" in text
     unlikely = first_page(reported(site, with_ends(plain, 0.8, 0.8)))
-    assert "Restrained against rotation" not in unlikely
-    assert "Yielding" not in unlikely
+    assert "Rotational restraint" not in unlikely
+    assert "Bearing compliance" not in unlikely
     bridge = site.bridges[0].model_copy(update={"bearings": ("sprung", "unknown")})
     declared = site.model_copy(update={"bridges": (bridge,)})
     text = first_page(reported(declared, with_ends(plain, 0.998, 0.95)))
-    assert "Restrained against rotation" not in text
-    assert "Yielding vertically" in text
+    assert "Rotational restraint" not in text
+    assert "Bearing compliance, vertical yielding under the load" in text
 
 
 def test_excluded_crossings_have_number_and_reason(site: Site) -> None:
@@ -303,6 +303,20 @@ def test_excluded_crossings_have_number_and_reason(site: Site) -> None:
     why = [REASON_TEXTS[code].removesuffix(".") for code in (GAP, OUTAGE)]
     assert f"Excluded: 1 rejected ({why[0]}); 2 suspect ({why[1]})." in text
     assert "Excluded" not in first_page(reported(site, fused(site, KNOWN)))
+
+
+@pytest.mark.parametrize(("code", "unused"), [("en", "no"), ("de", "nein")])
+def test_evidence_states_why_a_good_crossing_is_not_used(
+    site: Site, code: str, unused: str
+) -> None:
+    left_out = [{"crossing_id": "c", "reason": "disagrees"}]
+    results = fused(site, KNOWN, crossings_used=["a", "b"], crossings_left_out=left_out)
+    text = reported(site, results, language=code).text
+    assert f"{unused} {language_of(code).left_out['disagrees']}" in text
+    assert (
+        language_of(code).left_out["disagrees"]
+        not in reported(site, fused(site, KNOWN), language=code).text
+    )
 
 
 def test_glossary_ignores_names_within_the_markup(site: Site) -> None:
