@@ -16,7 +16,13 @@ from services.common.extras import check_extras
 from services.common.language import ENGLISH, Language
 from services.execution.blas import one_blas_thread
 from services.history.bridge_history import BridgeHistory
-from services.identification.comparison import Comparison, Estimate, compare, per_cent_up
+from services.identification.comparison import (
+    Comparison,
+    Estimate,
+    Stated,
+    compare,
+    per_cent_up,
+)
 from services.report.cautions import CautionBasis, cautions
 from services.report.earlier import Before, SurveyFile, before_of, combined_surveys
 from services.viewer.bridge_view import BridgeView, describe_bridge, view_of_bridge
@@ -261,9 +267,8 @@ def _finding(
         return BridgeFinding(kind, language.text("finding.none") + but, wording)
     # The headline names the unresolved elements unless they are most of them.
     are_named = 2 * len(view.unresolved) <= len(view.comparison.elements)
-    described = describe_bridge(
-        view, language, ("visible", "unresolved") if are_named else ("visible",)
-    )
+    without: tuple[Stated, ...] = ("visible", "unresolved") if are_named else ("visible",)
+    described = describe_bridge(view, language, without)
     sentences = (*described, *single, _seen(view.comparison, language))
     return BridgeFinding("open", missed + but, sentences)
 

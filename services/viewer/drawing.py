@@ -367,7 +367,7 @@ def legend_beside_title(axes: Axes) -> None:
         room = axes.get_window_extent().width / legend.get_window_extent().width
         if room < 1.0:
             for text in legend.get_texts():
-                text.set_fontsize(room * text.get_fontsize())
+                text.set_fontsize(room * float(text.get_fontsize()))
 
 
 def write_centred(axes: Axes, text: str) -> None:
