@@ -109,13 +109,13 @@ def _check(
         check_draws(asked.draws, asked.search_method)
         if executing is not None:
             raise InputError("--draws: are kept in this process only, leave --scheduler out")
-    if asked.json is not None and asked.json.suffix != ".json":
-        _log.warning("%s: the file will hold JSON; its usual name ends in .json", asked.json)
     for path in (asked.json, asked.rrd, asked.draws):
         if path is not None:
             check_writable(path)
     if asked.figures is not None:
         check_folder_writable(asked.figures)
+    if asked.json is not None and asked.json.suffix != ".json":
+        _log.warning("%s: the file will hold JSON; its usual name ends in .json", asked.json)
 
 
 class _IdentifyRequest(NamedTuple):
