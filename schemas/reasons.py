@@ -149,6 +149,7 @@ class BridgeReason(StrEnum):
     NO_GOOD_CROSSING = "no_good_crossing"
     NOT_FUSED = "not_fused"
     CROSSINGS_DISAGREE = "crossings_disagree"
+    NEWEST_DISAGREE = "newest_disagree"
     MANY_LEFT_OUT = "many_left_out"
     USES_SUSPECT = "uses_suspect"
 
@@ -162,7 +163,11 @@ BRIDGE_REASON_TEXTS: Final[dict[BridgeReason, str]] = {
         "Crossings disagree by more than their uncertainty and the between-crossing variability "
         "explain, and there are too few of them to find which one is wrong."
     ),
-    BridgeReason.MANY_LEFT_OUT: "More than a third of the good crossings disagree with the others.",
+    BridgeReason.NEWEST_DISAGREE: (
+        "The newest crossings disagree with the earlier ones, from which the values are: the "
+        "bridge may have changed."
+    ),
+    BridgeReason.MANY_LEFT_OUT: "Two or more good crossings disagree with the others.",
     BridgeReason.USES_SUSPECT: "Suspect crossings were fused on request.",
 }
 

@@ -4,7 +4,7 @@ Only the data needed for the state are kept, so that the thousandth crossing cos
 first.
 """
 
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,9 +23,11 @@ from schemas.results import (
     ThirdsState,
 )
 from services.common.arrays import Floats
+from services.common.language import ENGLISH
 from services.identification.comparison import (
     Comparison,
     compare,
+    describe_clear_elements,
     describe_comparison,
     estimate_of_state,
     unresolved_elements,
@@ -38,7 +40,12 @@ from services.identification.usable import RecentCrossings as RecentCrossings
 from services.identification.usable import add_crossings as add_crossings
 from services.identification.usable import usable as usable
 
-_MANY = 1.0 / 3.0
+_MANY = 2
+"""Crossings excluded as contradictory, from which on a state is doubtful: one alone is an error of
+that crossing, of several the bridge itself may have changed."""
+_CONTRADICTIONS = frozenset(
+    (BridgeReason.CROSSINGS_DISAGREE, BridgeReason.NEWEST_DISAGREE, BridgeReason.MANY_LEFT_OUT)
+)
 
 
 class FusionSettings(NamedTuple):
@@ -141,13 +148,21 @@ def state_of(
     return state.model_copy(update={"finding": _finding(found, state, baseline)})
 
 
-def _reasons(found: FusedBridge, crossings: Iterable[FusableCrossing]) -> tuple[BridgeReason, ...]:
-    """Return why a state is doubtful; nothing for a good one."""
+def _reasons(found: FusedBridge, crossings: Sequence[FusableCrossing]) -> tuple[BridgeReason, ...]:
+    """Return why a state is doubtful; nothing for a good one.
+
+    `crossings` are in the order of their entries.
+    """
     reasons = []
     if found.disagree:
         reasons.append(BridgeReason.CROSSINGS_DISAGREE)
-    if len(found.left_out) > _MANY * (len(found.left_out) + len(found.used)):
-        reasons.append(BridgeReason.MANY_LEFT_OUT)
+    if len(found.left_out) >= _MANY:
+        newest = {one.crossing_id for one in crossings[-_MANY:]}
+        reasons.append(
+            BridgeReason.NEWEST_DISAGREE
+            if newest <= set(found.left_out)
+            else BridgeReason.MANY_LEFT_OUT
+        )
     if any(one.verdict != "good" and one.crossing_id in found.used for one in crossings):
         reasons.append(BridgeReason.USES_SUSPECT)
     return tuple(reasons)
@@ -262,6 +277,10 @@ def _summary(draws: Floats) -> ElementState:
 def _finding(found: FusedBridge, state: BridgeResult, baseline: BridgeResult | None) -> str:
     """Return the state in words: resolved and unresolved elements."""
     comparison = compared(state, found.nominal_nm2, found.element_lengths_m, baseline)
+    if _CONTRADICTIONS.intersection(state.reasons):
+        # The excluded crossings may show what the others do not: no element is cleared.
+        clear = [] if comparison is None else describe_clear_elements(comparison)
+        return " ".join([*clear, ENGLISH.text("contradicted")])
     return " ".join(
         describe_comparison(comparison, unresolved_elements(state.elements.values()), state.level)
     )

@@ -183,6 +183,28 @@ def test_one_that_disagrees_is_named() -> None:
     assert (two.verdict, two.reasons) == ("suspect", (BridgeReason.CROSSINGS_DISAGREE,))
 
 
+def test_newest_crossings_that_disagree_give_no_all_clear() -> None:
+    """An element loses half before the last two of ten: fewer than a third are excluded."""
+    sound, weak = (1.0,) * ELEMENTS, (1.0, 1.0, 0.5, 1.0, 1.0)
+    crossings = [crossing(n, sound if n < 8 else weak) for n in range(10)]
+    found = state(crossings)
+    left = {one.crossing_id: one.reason for one in found.crossings_left_out}
+    assert left == {one.crossing_id: LeftOutReason.DISAGREES for one in crossings[-2:]}
+    assert (found.verdict, found.reasons) == ("suspect", (BridgeReason.NEWEST_DISAGREE,))
+    assert "newest crossings disagree with the earlier ones" in found.reason_texts[0]
+    assert "the bridge may have changed" in found.reason_texts[0]
+    assert found.finding is not None
+    assert "would show" not in found.finding
+    assert "No element differs" not in found.finding
+
+
+def test_two_earlier_crossings_that_disagree_are_doubtful() -> None:
+    sound, wrong = (1.0,) * ELEMENTS, (1.0, 1.8, 0.6, 1.0, 1.0)
+    found = state([crossing(n, wrong if n in (2, 5) else sound) for n in range(10)])
+    assert len(found.crossings_left_out) == 2
+    assert (found.verdict, found.reasons) == ("suspect", (BridgeReason.MANY_LEFT_OUT,))
+
+
 def test_crossings_with_other_elements_are_left_out() -> None:
     found = state([crossing(0, (1.0,) * 4), crossing(1), crossing(2)])
     assert [one.reason for one in found.crossings_left_out] == [LeftOutReason.OTHER_MODEL]
