@@ -50,6 +50,20 @@ _NICE: Final = 10
 _Request = Callable[[VehicleBridgePair], None]
 
 
+class WaitingCounts(NamedTuple):
+    """Numbers of recorded crossings without a result that are not in progress."""
+
+    for_process: int = 0
+    for_validation: int = 0
+    for_data: int = 0
+    """Those of which samples are missing that may still arrive."""
+
+    @property
+    def total(self) -> int:
+        """Number of all of them."""
+        return sum(self)
+
+
 class _MissingStay(NamedTuple):
     """A stay without a result."""
 
@@ -92,8 +106,8 @@ class Backfill:
         self._reads = 0
         self._warned: set[str] = set()
         self._asked: set[VehicleBridgePair] = set()
-        self.waiting = 0
-        """Number of recorded crossings without a known result."""
+        self._next_count_s = 0.0
+        self.waiting = WaitingCounts()
 
     def close(self) -> None:
         """End the reading process."""
@@ -131,6 +145,9 @@ class Backfill:
             self._ledger.forget_before(now - self._source.age_s - MARGIN_S)
         self._collect()
         self._ledger.commit(time.time())
+        if now_s >= self._next_count_s:
+            self._next_count_s = now_s + _FETCH_EVERY_S
+            self._count(engine, want)
         if self._scanning is None and not self._fetching:
             if self._recordings.groups:
                 self._begin_scan(self._recordings.groups.popleft())
@@ -141,6 +158,7 @@ class Backfill:
             stay, found = self._found.popleft()
             if self._is_open(engine, stay):
                 yield from engine.take(found, self._others(found))
+            self._next_count_s = 0.0
         if not (self._recordings.groups or self._scanning or self._fetching or self._found):
             self.close()
 
@@ -206,26 +224,24 @@ class Backfill:
 
     # What is fetched
 
+    def _count(self, engine: Engine, want: _Request) -> list[_MissingStay]:
+        """Count the waiting crossings and request validations; return those that may be fetched."""
+        self._open = [
+            m for m in self._open if m.stay not in self._given_up and not self._is_over(m.stay)
+        ]
+        waiting = [one for one in self._open if self._is_open(engine, one.stay)]
+        proven = [one for one in waiting if engine.is_certified(_pair_of(one.stay))]
+        due = [one for one in proven if self._is_due(one.stay)]
+        self.waiting = WaitingCounts(len(due), len(waiting) - len(proven), len(proven) - len(due))
+        for pair in dict.fromkeys(_pair_of(one.stay) for one in waiting):
+            if pair not in self._asked and not engine.is_certified(pair):
+                self._asked.add(pair)
+                want(pair)
+        return due
+
     def _fetch(self, engine: Engine, want: _Request) -> None:
         """Fetch the next crossings that may be identified, of one boot of a truck."""
-        self._open = [
-            one
-            for one in self._open
-            if one.stay not in self._given_up and not self._is_over(one.stay)
-        ]
-        ready = []
-        self.waiting = 0
-        for one in self._open:
-            if not self._is_open(engine, one.stay):
-                continue
-            self.waiting += 1
-            pair = VehicleBridgePair(one.stay.vehicle, one.stay.bridge)
-            if not engine.is_certified(pair):
-                if pair not in self._asked:
-                    self._asked.add(pair)
-                    want(pair)
-            elif self._is_due(one.stay):
-                ready.append(one)
+        ready = self._count(engine, want)
         if ready:
             first = ready[0].stay
             boot = (first.vehicle, first.boot_id)
@@ -306,6 +322,10 @@ class Backfill:
             if one.stay.bridge == data.bridge.id
             and overlap(one.stay.entry_ns, one.stay.exit_ns, found.entry_ns, found.exit_ns)
         }
+
+
+def _pair_of(stay: RecordedStay) -> VehicleBridgePair:
+    return VehicleBridgePair(stay.vehicle, stay.bridge)
 
 
 def _is_same(one: RecordedStay, other: RecordedStay) -> bool:

@@ -10,10 +10,16 @@ from schemas.results import CrossingResult, verdict_line
 from services.common.log_lines import about
 from services.execution.dispatch import CrossingExecutor
 from services.identification.engine import Engine
-from services.worker.backfill import Backfill
+from services.worker.backfill import Backfill, WaitingCounts
 
 _log = logging.getLogger(__name__)
 _LONGEST_NOTE = 1000
+_CAUSES = {
+    "for_process": "for a process",
+    "for_validation": "for a site validation",
+    "for_data": "for missing samples",
+}
+"""Causes by the fields of `WaitingCounts`."""
 
 
 class QueueLag(NamedTuple):
@@ -30,7 +36,7 @@ class Workload(NamedTuple):
     running: tuple[str, ...]
     waiting: int
     waiting_for_certificate: int
-    in_recordings: int
+    in_recordings: WaitingCounts
 
 
 def workload(engine: Engine, execution: CrossingExecutor, source: Backfill | None) -> Workload:
@@ -41,7 +47,7 @@ def workload(engine: Engine, execution: CrossingExecutor, source: Backfill | Non
         tuple(one.crossing_id for one in execution.running),
         execution.waiting + ready,
         sum(waiting.values()) - ready,
-        0 if source is None else source.waiting,
+        WaitingCounts() if source is None else source.waiting,
     )
 
 
@@ -71,7 +77,8 @@ def publish_health(
     running = execution.running
     notes = [f"{name} is being identified for {seconds:.0f} s" for name, seconds in running]
     notes += [f"{load.waiting} wait for a process"] if load.waiting else []
-    notes += [f"{load.in_recordings} wait in recordings"] if load.in_recordings else []
+    recorded = load.in_recordings._asdict().items()
+    notes += [f"{n} in recordings wait {_CAUSES[cause]}" for cause, n in recorded if n]
     notes += [note] if note else []
     figures = {
         "queue": float(behind.messages),
@@ -80,7 +87,7 @@ def publish_health(
         "identifying_longest_s": max((one.seconds for one in running), default=0.0),
         "waiting_for_process": float(load.waiting),
         "waiting_for_certificate": float(load.waiting_for_certificate),
-        "waiting_in_recordings": float(load.in_recordings),
+        "waiting_in_recordings": float(load.in_recordings.total),
     } | {f"crossings/{verdict}": float(number) for verdict, number in verdicts.items()}
     health = pb.Health(
         schema_version=1,

@@ -25,12 +25,13 @@ from services.logger.completeness import Completeness
 from services.logger.file_layout import RecordingTarget
 from services.logger.intake import Intake
 from services.logger.writer import FileWriter, count_all
+from services.worker.backfill import WaitingCounts
 from services.worker.health import QueueLag, Workload, publish_health
 from tests.endpoints import free_endpoint
 from tests.waiting import until
 
 NAMES = {metric.figure for metric in METRICS}
-OF_WORKER = QueueLag(3, 0.5), Workload(("a",), 1, 2, 3)
+OF_WORKER = QueueLag(3, 0.5), Workload(("a",), 1, 2, WaitingCounts(1, 2))
 
 
 def health(time_s: float, **figures: float) -> bytes:

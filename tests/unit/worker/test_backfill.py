@@ -22,7 +22,7 @@ from services.identification.known import search_hash
 from services.identification.waiting import Validations
 from services.ledger.crossing_log import Ledger
 from services.recordings.writer import RecordingOrigin, RecordingWriter
-from services.worker.backfill import Backfill
+from services.worker.backfill import Backfill, WaitingCounts
 from services.worker.recording_list import BackfillSource
 from tests.builders.ledger import known_crossings
 from tests.identifications import Identifications
@@ -159,7 +159,7 @@ def test_what_nobody_sends_any_more_gets_its_result_once(
     worker = Worker(tmp_path)
     assert ids(worker.go_on()) == IDS
     assert sorted(worker.sent) == sorted(output_of(WHOLE))  # byte for byte, states too
-    assert worker.backfill.waiting == 0
+    assert worker.backfill.waiting.total == 0
     assert worker.go_on() == []
 
 
@@ -282,7 +282,7 @@ def test_without_a_certificate_they_stay_in_the_recording(
     assert worker.go_on() == []
     pair = VehicleBridgePair("truck-1", "bridge-1")
     assert worker.wanted == [pair]
-    assert worker.backfill.waiting == 2
+    assert worker.backfill.waiting == WaitingCounts(for_validation=2)
     assert worker.sent == []
     worker.engine.certify(pair, "0123456789abcdef")
     results = worker.go_on()
@@ -359,7 +359,7 @@ def test_one_that_may_still_become_whole_waits_until_nothing_more_is_recorded(
     path = record([m for m in TWO if not is_in_hole(m)], ago_s=10.0)
     worker = Worker(tmp_path)
     assert ids(worker.go_on()) == IDS[1:]
-    assert worker.backfill.waiting == 1
+    assert worker.backfill.waiting == WaitingCounts(for_data=1)
     names = len(worker.reader.names)
     assert worker.go_on() == []
     assert len(worker.reader.names) == names  # it is not asked for again and again
@@ -382,6 +382,28 @@ def test_what_a_spool_brings_later_makes_it_whole(
 def is_in_hole(message: Message) -> bool:
     time_s = message.log_time_ns * 1e-9 - START_S
     return message.key.stream == "accel" and 7.0 < time_s < 8.0
+
+
+def test_running_and_done_crossings_do_not_wait_in_recordings(
+    tmp_path: Path, record: Callable[..., Path]
+) -> None:
+    """Also while another recording is scanned, when nothing is fetched."""
+    record(TWO)
+    worker = Worker(tmp_path)
+    for _ in range(3):
+        worker._now_s += 20.0
+        list(worker.backfill.advance(worker.engine, worker._now_s, has_room=False, want=print))
+    assert worker.backfill.waiting == WaitingCounts(for_process=2)
+    for left in (1, 0):
+        for has_room in (True, False):
+            worker._now_s += 0.1
+            worker._published(
+                worker.backfill.advance(worker.engine, worker._now_s, has_room=has_room, want=print)
+            )
+        assert worker.backfill.waiting == WaitingCounts(for_process=left)
+    record(strangers(), "stranger-20260101T000000Z.mcap")
+    worker.go_on(1)
+    assert worker.backfill.waiting.total == 0
 
 
 def test_key_of_another_realm(tmp_path: Path, record: Callable[..., Path]) -> None:
