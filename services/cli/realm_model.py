@@ -4,6 +4,7 @@ No bus, no terminal, no clock: the time is given with each message.
 """
 
 from collections import deque
+from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -44,8 +45,9 @@ _MAX_TRUCKS: Final = 200
 _MAX_BRIDGES: Final = 200
 _MAX_SERVICES: Final = 50
 
+ON_BRIDGE: Final = "on the bridge"
 _STATES: Final = {
-    pb.DETECTED: "on the bridge",
+    pb.DETECTED: ON_BRIDGE,
     pb.COMPLETE: "complete",
     pb.WAITING_NOT_VALIDATED: "waits for validation",
     pb.IDENTIFYING: "identifying",
@@ -139,6 +141,8 @@ class RealmModel:
         self.services: dict[str, ServiceRow] = {}
         self.work: dict[str, str] = {}
         """Present work of a service besides crossings, such as a site validation."""
+        self._boots: dict[str, int] = {}
+        """Boot of the last message of each service."""
         self._elements: dict[str, ResultElements] = {}
 
     def ingest(self, message: BusMessage, now_s: float, now_ns: int) -> str | None:
@@ -146,7 +150,9 @@ class RealmModel:
 
         Return a line on what is new for a reader of a log. Undecodable messages are skipped.
         """
-        key, _, payload = message
+        key, identity, payload = message
+        if key.owner == "service":
+            self._note_boot(key.identifier, identity.boot_id)
         try:
             match (key.owner, key.stream):
                 case ("vehicle", "accel" | "gnss"):
@@ -173,7 +179,7 @@ class RealmModel:
     @property
     def waiting(self) -> int:
         """Number of crossings without a result whose truck has left."""
-        return sum(not row.is_over and row.state != "on the bridge" for row in self.rows())
+        return sum(not row.is_over and row.state != ON_BRIDGE for row in self.rows())
 
     def rows(self) -> list[CrossingRow]:
         """Return the crossings, the newest first."""
@@ -214,7 +220,7 @@ class RealmModel:
                 message.entry_time_ns, state,
             )  # fmt: skip
         self.crossings[row.crossing_id] = row._replace(state=state, fraction=None)
-        return f"{route_text(row)}: {state}"
+        return f"{_named(row)}: {state}"
 
     def _take_result(self, crossing: CrossingResult) -> str:
         row = CrossingRow(
@@ -235,7 +241,7 @@ class RealmModel:
             row = _with_elements(row, crossing, elements)
         self._make_room()
         self.crossings[row.crossing_id] = row
-        return f"{route_text(row)}: {verdict_line(crossing)}"
+        return f"{_named(row)}: {verdict_line(crossing)}"
 
     def _take_bridge(self, bridge: str, state: BridgeResult) -> str | None:
         elements = self._elements.get(bridge)
@@ -272,6 +278,14 @@ class RealmModel:
         self.alarms[alarm.bridge] = alarm
         return f"alarm of {alarm.bridge}: {alarm.sentence()}: {alarm_state(alarm)}"
 
+    def _note_boot(self, service: str, boot_id: int) -> None:
+        """Forget the work of a service's process that another one has replaced."""
+        if self._boots.get(service) != boot_id:
+            if len(self._boots) >= _MAX_SERVICES:
+                self._boots.pop(next(iter(self._boots)))
+            self._boots[service] = boot_id
+            self.work.pop(service, None)
+
     def _take_health(self, name: str, message: pb.Health) -> str:
         if name not in self.services and len(self.services) >= _MAX_SERVICES:
             self.services.pop(next(iter(self.services)))
@@ -297,6 +311,12 @@ class RealmModel:
 def route_text(row: CrossingRow) -> str:
     """Return vehicle, bridge and direction."""
     return f"{row.vehicle} {'→' if row.forward else '←'} {row.bridge}"
+
+
+def _named(row: CrossingRow) -> str:
+    """Return a crossing's direction and entry time, which distinguish it in a log."""
+    entry = datetime.fromtimestamp(row.entry_ns * 1e-9, UTC)
+    return f"{route_text(row)}, entry {entry:%Y-%m-%d %H:%M:%S}"
 
 
 def _weight(alarm: Alarm) -> tuple[bool, float]:

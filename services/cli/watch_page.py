@@ -12,6 +12,7 @@ from schemas.alarms import Alarm
 from schemas.topics import is_from_recording
 from services.bus.realm_listener import other_realms_hint
 from services.cli.realm_model import (
+    ON_BRIDGE,
     SILENT_S,
     BridgeRow,
     CrossingRow,
@@ -41,6 +42,8 @@ _MAX_BRIDGES: Final = 4
 NO_ALARM: Final = (
     "No alarm was received; it is not known here whether driveby alarm serve watches any bridge."
 )
+_HELD: Final = "waits for samples"
+"""State of a crossing whose truck sends nothing before the crossing is decided."""
 _VERDICTS: Final = {"good": "green", "suspect": "yellow", "rejected": "red"}
 
 
@@ -84,7 +87,8 @@ def page(
             parts.append(Text(f"  and {len(trucks) - most_trucks} more", style="dim"))
     if rows:
         shown = rows[: max(3, room - most_trucks)]
-        parts.append(_crossings(shown, is_wide=is_wide))
+        driving = model.trucks.keys() - silent_trucks(model, now_s)
+        parts.append(_crossings(shown, driving, is_wide=is_wide))
         if len(rows) > len(shown):
             parts.append(Text(f"  and {len(rows) - len(shown)} earlier", style="dim"))
     if model.bridges and not alarms:
@@ -194,11 +198,12 @@ def _wrong_time_notes(trucks: Sequence[tuple[str, TruckRow]], realm: str) -> lis
     ]
 
 
-def _crossings(rows: Sequence[CrossingRow], *, is_wide: bool) -> Table:
+def _crossings(rows: Sequence[CrossingRow], driving: Set[str], *, is_wide: bool) -> Table:
     names = ("entry", "crossing", "", "EI", "lowest, of nominal (95 %)")
     table = _table(*names, *(["why"] if is_wide else []))
     for row in rows:
-        state = Text(row.state, style=_VERDICTS.get(row.state, ""))
+        is_held = row.state == ON_BRIDGE and row.vehicle not in driving
+        state = Text(_HELD if is_held else row.state, style=_VERDICTS.get(row.state, ""))
         if row.fraction is not None and not row.is_over:
             state.append(f" {100.0 * row.fraction:.0f} %")
         why = Text(row.reason, style="dim")
@@ -268,7 +273,8 @@ def _services(model: RealmModel, now_ns: int) -> Table:
             state = Text(f"silent {_length(age_s)}", style="red")
         elif not service.ok:
             state = Text("not well", style="red")
-        notes = [service_figures(service), model.work.get(name, "")]
+        work = "" if age_s > _LATE_S else model.work.get(name, "")
+        notes = [service_figures(service), work]
         table.add_row(name, state, "; ".join(one for one in notes if one))
     return table
 

@@ -70,7 +70,8 @@ def test_what_the_readme_says_happens(endpoint: str, project: Path, tmp_path: Pa
                 until(partial(is_ready, name), f"the {name}")
         assert started["truck"].wait(timeout=LONGEST_S) == 0, seen("truck")
         lowest = r"good, lowest EI_4 0\.4\d\d of nominal \(95 %: 0\.3\d\d to 0\.4\d\d\)\n"
-        until(lambda: re.search(rf"truck-1 → bridge-1: {lowest}", seen("watch")), "the result")
+        shown = rf"truck-1 → bridge-1, entry [\d: -]+: {lowest}"
+        until(lambda: re.search(shown, seen("watch")), "the result")
         for state in ("truck-1 drives", "on the bridge", "complete", "identifying"):
             assert state in seen("watch")
         assert re.search(rf"truck-1\.bridge-1\.\S+Z: {lowest}", seen("worker"))

@@ -52,7 +52,10 @@ def test_lines_into_a_pipe(
     )
     try:
         assert watch.stdout is not None
-        wanted = "truck-1 → bridge-1: good, lowest EI_4 0.400 of nominal (95 %: 0.377 to 0.424)"
+        wanted = (
+            "truck-1 → bridge-1, entry 2026-09-21 14:13:20: "
+            "good, lowest EI_4 0.400 of nominal (95 %: 0.377 to 0.424)"
+        )
         for output in watch.stdout:
             found = LINE.fullmatch(output)
             assert found, output

@@ -7,6 +7,7 @@ import pytest
 from rich.console import Console
 
 from schemas.proto import driveby_pb2 as pb
+from schemas.signals import Identity
 from schemas.site import Site
 from services.bus.realm_listener import BusMessage
 from services.cli import main as cli
@@ -120,10 +121,13 @@ def test_lines_for_a_pipe(site: Site) -> None:
     ]
     assert output == [
         "truck-1 drives",
-        "truck-1 → bridge-1: on the bridge",
-        "truck-1 → bridge-1: complete",
-        "truck-1 → bridge-1: identifying",
-        "truck-1 → bridge-1: good, lowest EI_4 0.400 of nominal (95 %: 0.377 to 0.424)",
+        "truck-1 → bridge-1, entry 2026-09-21 14:13:20: on the bridge",
+        "truck-1 → bridge-1, entry 2026-09-21 14:13:20: complete",
+        "truck-1 → bridge-1, entry 2026-09-21 14:13:20: identifying",
+        (
+            "truck-1 → bridge-1, entry 2026-09-21 14:13:20: "
+            "good, lowest EI_4 0.400 of nominal (95 %: 0.377 to 0.424)"
+        ),
         "logger is NOT WELL: 3 messages/s, disk full",
     ]
 
@@ -177,7 +181,30 @@ def test_a_service_that_is_silent_or_unwell_stands_out() -> None:
     assert line(drawn(watched), "logger") == "logger not well disk full"
     assert line(drawn(watched), "worker") == "worker well validating truck-1 on bridge-1, 30 %"
     watched.services["worker"] = watched.services["worker"]._replace(time_ns=NOW_NS - 10**12)
-    assert line(drawn(watched), "worker").startswith("worker silent 17 min")
+    silent = line(drawn(watched), "worker")
+    assert silent.startswith("worker silent 17 min")
+    assert "validating" not in silent
+
+
+def test_work_of_a_replaced_worker_is_not_shown() -> None:
+    """It was killed while it validated, and the next one skips the validation."""
+    watched = RealmModel()
+    deliver(watched, health("worker"))
+    deliver(watched, progress("worker", "", "validating truck-1 on bridge-1", 0.33))
+    assert "33 %" in line(drawn(watched), "worker")
+    deliver(watched, health("worker")._replace(identity=Identity(2, 0)))
+    assert line(drawn(watched), "worker") == "worker well"
+
+
+def test_crossing_of_a_silent_truck_waits_for_samples() -> None:
+    watched = RealmModel()
+    deliver(watched, state("a", pb.DETECTED, "truck-1", 0.0))
+    drives(watched, "truck-1")
+    assert line(drawn(watched), "14:13:20").endswith("on the bridge")
+    watched = RealmModel()
+    deliver(watched, state("a", pb.DETECTED, "truck-1", 0.0))
+    drives(watched, "truck-1", ago_s=20.0)
+    assert line(drawn(watched), "14:13:20").endswith("waits for samples")
 
 
 def test_what_it_keeps_is_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
