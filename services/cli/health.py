@@ -14,7 +14,8 @@ import zenoh
 from schemas.messages import decode
 from schemas.proto import driveby_pb2 as pb
 from schemas.topics import PREFIX, check_identifier, check_realm, key
-from services.bus.credentials import unlisted_hint
+from services.bus.access_control import read_by
+from services.bus.credentials import check_credentials, unlisted_hint
 from services.bus.session import open_session
 from services.bus.subscription import Subscription
 from services.common.errors import FailureError, InputError
@@ -52,11 +53,7 @@ def health_command(
         if elsewhere:
             hint = f"it answers with --realm {' or '.join(elsewhere)}"
         else:
-            or_unlisted = "" if tls is None else f"; or {unlisted_hint(tls)}"
-            hint = (
-                "--realm NAME asks another (a logger of several realms or a pattern: live)"
-                f"{or_unlisted}"
-            )
+            hint = silence_hint(where, tls)
         raise FailureError(f"{service} in realm {realm} sends nothing at {endpoint}; {hint}")
     age_s = time.time() - latest.time_ns * 1e-9
     if age_s > OLDEST_S:
@@ -69,6 +66,20 @@ def health_command(
     if age_s < -_AHEAD_S:
         notes.append(f"its clock is {-age_s:.0f} s ahead of this machine's")
     return "; ".join([f"{service} in realm {realm} is well, {max(age_s, 0.0):.0f} s ago", *notes])
+
+
+def silence_hint(where: str, tls: Path | None) -> str:
+    """Return why no health arrives at a key: the likeliest cause first."""
+    hint = (
+        "it was not started or has ended, or it is in another realm (--realm NAME; live for a "
+        "logger of several realms)"
+    )
+    if tls is None:
+        return hint
+    subject, wanted = check_credentials(tls), zenoh.KeyExpr(where)
+    if not any(zenoh.KeyExpr(keys).intersects(wanted) for keys in read_by(subject)):
+        return f"{subject} may not read it; use the credentials of a viewer"
+    return f"{hint}, or {unlisted_hint(tls)}"
 
 
 def _realms_of(session: zenoh.Session, service: str) -> list[str]:

@@ -21,7 +21,7 @@ from schemas.topics import Key, check_identifier, check_realms, key, selector
 from services.bus.playback import stopped_by_signals
 from services.bus.session import open_session, wait_for_router
 from services.bus.subscription import RawSample, Subscription
-from services.cli.health import OLDEST_S
+from services.cli.health import OLDEST_S, silence_hint
 from services.common.errors import FailureError, InputError
 
 _log = logging.getLogger(__name__)
@@ -92,7 +92,7 @@ def metrics_command(
     if not found:
         who = service or "every service"
         raise FailureError(
-            f"{who} in realm {realm} sends nothing at {endpoint}; --realm NAME asks another"
+            f"{who} in realm {realm} sends nothing at {endpoint}; {silence_hint(where, tls)}"
         )
     return exposition(found)
 

@@ -16,8 +16,8 @@ def test_silent_service_is_named_with_its_realm(endpoint: str) -> None:
     with open_session(listen=endpoint), pytest.raises(FailureError) as caught:
         health_command(service="logger", endpoint=endpoint, tls=None, realm="sim-a", patience_s=0.5)
     assert str(caught.value) == (
-        f"logger in realm sim-a sends nothing at {endpoint}; --realm NAME asks another (a logger "
-        "of several realms or a pattern: live)"
+        f"logger in realm sim-a sends nothing at {endpoint}; it was not started or has ended, or "
+        "it is in another realm (--realm NAME; live for a logger of several realms)"
     )
 
 
@@ -29,6 +29,22 @@ def test_silence_with_credentials_names_the_list(credentials: Path, tls_endpoint
     ):
         health_command(
             service="logger", endpoint=tls_endpoint, tls=tls, realm="live", patience_s=0.5
+        )
+
+
+def test_silence_with_credentials_of_a_truck_names_its_role(
+    credentials: Path, tls_endpoint: str
+) -> None:
+    with (
+        open_session(listen=tls_endpoint, tls=credentials / "logger"),
+        pytest.raises(FailureError, match="; truck/truck-1 may not read it; use the credentials"),
+    ):
+        health_command(
+            service="logger",
+            endpoint=tls_endpoint,
+            tls=credentials / "truck-1",
+            realm="live",
+            patience_s=0.5,
         )
 
 
