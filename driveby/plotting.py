@@ -25,8 +25,9 @@ def plot(
     """Draw one crossing, with the truth next to it where it is known, or one fused bridge.
 
     An `Identification` of several crossings is refused with InputError: draw its `solutions` one by
-    one. `bridge` selects one of several that are fused. The figure is no pyplot's: Jupyter shows it
-    after `%matplotlib inline`, and `figure.savefig("crossing.png", dpi=200)` writes it.
+    one. `bridge` selects one of several that are fused. Jupyter shows the figure after
+    `%matplotlib inline`, `pyplot.show()` does not; `figure.savefig("crossing.png", dpi=200)` writes
+    it.
     """
     if truth is not None and not isinstance(truth, Simulation):
         raise wrong("truth", truth, "what simulate() returns")

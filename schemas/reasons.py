@@ -160,8 +160,8 @@ BRIDGE_REASON_TEXTS: Final[dict[BridgeReason, str]] = {
         "The method provides no likelihood to fuse; this is the latest crossing alone."
     ),
     BridgeReason.CROSSINGS_DISAGREE: (
-        "Crossings disagree by more than their uncertainty and the between-crossing variability "
-        "explain, and there are too few of them to find which one is wrong."
+        "Crossings disagree by more than their uncertainty explains, and are too few to find the "
+        "wrong one."
     ),
     BridgeReason.NEWEST_DISAGREE: (
         "The newest crossings disagree with the earlier ones, from which the values are: the "

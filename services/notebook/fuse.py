@@ -1,15 +1,18 @@
 """Fusion of the crossings of several results, as by `driveby fuse`."""
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from os import PathLike
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
 
 from schemas.results import BridgeResult, CrossingResult, Results, load_results, results_json
 from schemas.site import Site
 from services.common.errors import InputError
+from services.common.extras import check_installed
 from services.common.field_docs import with_field_docs
 from services.common.files import check_writable, write_atomically
 from services.common.kinds import RESULTS
@@ -21,6 +24,14 @@ from services.notebook.read import Name, given_site
 from services.notebook.showing import RIGIDITY_HEAD, html_table, rigidity_cells
 from services.notebook.solution import Identification
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+_STATISTICS: Final = ("mean", "std", "q025", "q975")
+_COLUMNS: Final = [
+    *("bridge", "verdict", "crossings", "element", "from_m", "to_m"),
+    *(*_STATISTICS, "nominal", "ratio"),
+]
 RESULTS_EXPECTED: Final = (
     "the name of a results file, or what identify() or fuse() returns; "
     "several are several arguments"
@@ -44,6 +55,36 @@ class Fusion(NamedTuple):
     def bridges(self) -> dict[str, BridgeResult]:
         """Fused estimate of each bridge, by its identifier."""
         return dict(self.results.bridges)
+
+    def elements(self) -> "pd.DataFrame":
+        """Return one row for each element of each bridge; needs pandas.
+
+        Columns: bridge, verdict, crossings (number of fused ones), element; from_m and to_m; mean,
+        std, q025 and q975 of EI in N·m²; nominal in N·m²; ratio (mean over nominal). Numbers are
+        NaN for a bridge without an estimate.
+        """
+        check_installed("a table of elements", "pandas")
+        import pandas as pd
+
+        rows = [row for name in self.bridges for row in self._element_rows(name)]
+        return pd.DataFrame(rows, columns=_COLUMNS)
+
+    def _element_rows(self, name: str) -> Iterator[dict[str, object]]:
+        state, of, start_m = self.bridges[name], self.elements_of[name], 0.0
+        lengths = zip(of.lengths_m, of.nominal_flexural_rigidity_nm2, strict=True)
+        for number, (length_m, nominal) in enumerate(lengths, start=1):
+            one = state.elements.get(f"EI_{number}")
+            found = {key: float(getattr(one, key, np.nan)) for key in _STATISTICS}
+            identity: dict[str, object] = {
+                "bridge": name,
+                "verdict": state.verdict,
+                "crossings": len(state.crossings_used),
+                "element": f"EI_{number}",
+                "from_m": start_m,
+                "to_m": start_m + length_m,
+            }
+            yield identity | found | {"nominal": nominal, "ratio": found["mean"] / nominal}
+            start_m += length_m
 
     def site_with(self, bridges: Iterable[str]) -> Site:
         """Return the site file; raise InputError without one that has all these bridges."""

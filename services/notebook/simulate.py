@@ -76,7 +76,10 @@ class Simulation(NamedTuple):
 
     @property
     def road_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """True profile under the tyres: chainage and height (m,), both in m."""
+        """True profile under the tyres: chainage and height (m,), both in m.
+
+        It is the mean of the given road over a tyre's contact length, so its short waves are lower.
+        """
         return self.drive.road.x_m, self.drive.road.height_m
 
     def messages(self) -> Iterator[Message]:
@@ -123,10 +126,10 @@ def simulate(
 
     The options are those of `driveby simulate`. The truth is a damage `scenario` of the paper (1 to
     12) or `ei` (n,), the ratio of each element's EI to its nominal value. `site` is by default that
-    of the paper. `road` is an ISO 8608 class, A to E, or a profile under both axles: chainages and
-    heights (n,) in m, level beyond its ends. `noise` is the accelerometers' noise density in
-    µg/√Hz; method pre needs some. `speed` is in m/s, or a pair (start, end); `rate` in Hz is by
-    default the site's. BLAS is limited to one thread meanwhile.
+    of the paper. `road` is an ISO 8608 class, A to E, or a profile under both axles: chainages from
+    the start of the bridge and heights (n,) in m, level beyond its ends. `noise` is the
+    accelerometers' noise density in µg/√Hz; method pre needs some. `speed` is in m/s, or a pair
+    (start, end); `rate` in Hz is by default the site's. BLAS is limited to one thread meanwhile.
 
     All drives begin at one time; crossings to be fused need others: `Simulation.started_at`.
 
@@ -145,7 +148,7 @@ def simulate(
     with one_blas_thread():
         drive = simulate_drive(
             known,
-            ratios_of(known.bridges[0], number_of, ratios),
+            ratios_of(known.bridges[0], number_of, ratios, prefix=""),
             DrivenRoad(given_road(road), whole("seed", seed, 0, (1 << 63) - 1)),
             Measurement(
                 density,

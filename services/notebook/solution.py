@@ -3,6 +3,7 @@
 pandas and xarray are needed only by the functions that return their types.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -84,9 +85,9 @@ class Solution(NamedTuple):
         return _parameters_of([self])
 
     def posterior(self) -> "xr.Dataset":
-        """Return the draws as arrays (chain, draw)."""
-        whole = posterior([_draws_of(self)])
-        return whole.isel(crossing=0) if whole.data_vars else whole
+        """Return the draws as arrays (chain, draw); raise InputError without draws."""
+        check_installed("a dataset of draws", "xarray")
+        return posterior([_draws_of(one) for one in _with_draws([self])]).isel(crossing=0)
 
 
 @with_field_docs
@@ -128,10 +129,12 @@ class Identification(NamedTuple):
     def posterior(self) -> "xr.Dataset":
         """Return the draws as arrays (chain, draw, crossing); needs xarray.
 
-        Longer chains are thinned to the shortest. For ArviZ:
+        Crossings without draws are omitted; without any draws InputError is raised. Longer chains
+        are thinned to the shortest. For ArviZ:
         `arviz.InferenceData(posterior=found.posterior())`.
         """
-        return posterior(_draws_of(solution) for solution in self.solutions)
+        check_installed("a dataset of draws", "xarray")
+        return posterior(_draws_of(solution) for solution in _with_draws(self.solutions))
 
     def prior(self) -> "xr.Dataset":
         """Return draws of the priors, named as the posterior's; needs xarray."""
@@ -147,9 +150,7 @@ class Identification(NamedTuple):
         """
         file = file_of(path)
         check_draws_file(file)
-        if not any(solution.draws for solution in self.solutions):
-            raise InputError(f"{file}: no crossing has draws; method pre has, with draws=True")
-        some = [solution for solution in self.solutions if solution.draws]
+        some = _with_draws(self.solutions, f"{file}: ")
         groups = {}
         if file.suffix == ".nc":
             crossings = [solution.crossing for solution in some]
@@ -175,6 +176,14 @@ def one_solution(name: str, found: object, function: str) -> Solution:
     if not isinstance(found, Solution):
         raise wrong(name, found, "what identify() returns or one of its solutions")
     return found
+
+
+def _with_draws(solutions: Sequence[Solution], place: str = "") -> list[Solution]:
+    """Return the solutions with draws; raise InputError if there are none."""
+    some = [solution for solution in solutions if solution.draws]
+    if not some:
+        raise InputError(f"{place}no crossing has draws; method pre has, with draws=True")
+    return some
 
 
 def _draws_of(solution: Solution) -> DrawsOfCrossing:

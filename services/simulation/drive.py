@@ -304,12 +304,17 @@ def _profile(low_m: float, high_m: float, road: str | Profile, seed: int) -> Pro
 
 def given_road(given: str | tuple[ArrayLike, ArrayLike]) -> str | Profile:
     """Return a class, or the profile of chainages and heights (n,) in m; InputError if invalid."""
+    right = "it must be a class from A to E or a pair of arrays (x_m, height_m)"
     if isinstance(given, str):
         if given not in tuple("ABCDE"):
-            raise InputError(f'road is "{given}", it must be a class from A to E')
+            raise InputError(f'road is "{given}", {right}')
         return given
+    if not isinstance(given, Sequence | np.ndarray) or len(given) != 2:
+        shape = np.shape(given) if isinstance(given, np.ndarray) else ()
+        what = f"an array of shape {shape}" if shape else f"of type {type(given).__name__}"
+        raise InputError(f"road is {what}, {right}")
+    x_m, height_m = given[0], given[1]
     try:
-        x_m, height_m = given
         road = Profile(np.asarray(x_m, dtype=np.float64), np.asarray(height_m, dtype=np.float64))
     except (TypeError, ValueError) as error:
         raise InputError("road has values that are no numbers") from error
@@ -388,17 +393,22 @@ def with_effects(car: HalfCar, beam: Beam, beyond: OutOfModelEffects) -> tuple[H
     )
 
 
-def ratios_of(bridge: Bridge, scenario: int | None, ei: Sequence[float] | None) -> Floats:
-    """Return EI over nominal by scenario or by element; raise InputError for a wrong number."""
+def ratios_of(
+    bridge: Bridge, scenario: int | None, ei: Sequence[float] | None, *, prefix: str = "--"
+) -> Floats:
+    """Return EI over nominal by scenario or by element; raise InputError for a wrong number.
+
+    `prefix` precedes the name of the option in the message.
+    """
     if scenario is not None:
         ratios = experiment.scenario_ratios(scenario)
-        option = "--scenario"
+        option = "scenario"
     else:
         ratios = np.array(ei or (), dtype=np.float64)
-        option = "--ei"
+        option = "ei"
     if ratios.size != bridge.elements:
         raise InputError(
-            f"{option}: gives {ratios.size} elements, but {bridge.id} of the site has "
+            f"{prefix}{option}: gives {ratios.size} elements, but {bridge.id} of the site has "
             f"{bridge.elements}"
         )
     return ratios

@@ -48,6 +48,7 @@ from services.viewer.drawing import (
 )
 
 HEIGHT_IN = 7.1
+_ERROR = "mean − truth, without offset and tilt"
 _HEIGHT_WITHOUT_ROAD_IN = 4.4
 _HEADING_IN, _BANNER_IN = 1.17, 0.36
 """Height of the heading above the first panel, and of a banner in addition."""
@@ -216,7 +217,7 @@ def _draw_differences(
         return
     mean = (road.front_m + road.rear_m) / 2.0
     between = road.front_m - road.rear_m
-    error = None if truth is None else mean - np.interp(road.x_m, *truth, left=np.nan, right=np.nan)
+    error = None if truth is None else _without_line(road.x_m, mean, truth)
     largest = float(np.nanmax(np.abs(between)))
     if error is not None and not np.isnan(error).all():
         largest = max(largest, float(np.nanmax(np.abs(error))))
@@ -224,7 +225,7 @@ def _draw_differences(
     axes.set_ylabel(unit)
     axes.axhline(0.0, color=MUTED, linewidth=0.7)
     if error is not None:
-        axes.plot(road.x_m, error * factor, color="#8a939c", linewidth=1.6, label="mean − truth")
+        axes.plot(road.x_m, error * factor, color="#8a939c", linewidth=1.6, label=_ERROR)
     axes.plot(
         road.x_m,
         between * factor,
@@ -233,6 +234,18 @@ def _draw_differences(
         label=crossing.difference_name,
     )
     legend_beside_title(axes)
+
+
+def _without_line(x_m: Floats, mean_m: Floats, truth: tuple[Floats, Floats]) -> Floats:
+    """Return the error of a mean profile (n,) without its offset and tilt; NaN beyond the truth.
+
+    Twice integrated accelerations determine neither of the two.
+    """
+    error = mean_m - np.interp(x_m, *truth, left=np.nan, right=np.nan)
+    known = np.isfinite(error)
+    if known.sum() > 2:
+        error -= np.polynomial.Polynomial.fit(x_m[known], error[known], 1)(x_m)
+    return error
 
 
 def _unit_of_length(largest_m: float) -> tuple[str, float]:

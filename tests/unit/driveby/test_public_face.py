@@ -380,8 +380,13 @@ def test_every_method_gives_the_same_type(
         assert solution.value["EI_4"].mean == one.elements()["mean"][3]
         assert solution.stats["iterations"] >= 3
         assert list(one.elements().columns) == columns
-        assert set(one.posterior().data_vars) == set(solution.draws)
-        assert set(solution.posterior().data_vars) == set(solution.draws)
+        if one is found:
+            assert set(one.posterior().data_vars) == set(solution.draws)
+            assert set(solution.posterior().data_vars) == set(solution.draws)
+            continue
+        for call in (one.posterior, solution.posterior):
+            with pytest.raises(driveby.InputError, match="no crossing has draws; method pre has"):
+                call()
     assert exact.elements()["ratio"].to_list() == pytest.approx([1, 1, 1, 0.4, 1, 1, 1], rel=0.01)
 
 
@@ -537,6 +542,19 @@ def test_plot_draws_estimate_and_truth(
     figure = driveby.plot(exact.solutions[0])
     assert "estimate, doubtful" in labels(figure)  # without a noise model it is
     assert "truth" not in labels(figure)
+    tilted = simulation.drive.road._replace(
+        height_m=simulation.drive.road.height_m + 0.02 + 1e-3 * simulation.drive.road.x_m
+    )
+    errors = [
+        next(one.get_ydata() for one in shown.axes[2].lines if "truth" in str(one.get_label()))
+        for shown in (
+            driveby.plot(exact, truth=simulation),
+            driveby.plot(
+                exact, truth=simulation._replace(drive=simulation.drive._replace(road=tilted))
+            ),
+        )
+    ]
+    assert np.nanmax(np.abs(errors[0] - errors[1])) < 1e-6 * np.nanmax(np.abs(errors[0]))
     assert (
         "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()
     )
@@ -569,6 +587,9 @@ def test_simulations_are_identified_one_by_one(simulation: driveby.Simulation) -
 # -- what is wrong is said in one line
 
 
+ROAD = "it must be a class from A to E or a pair of arrays (x_m, height_m)"
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
@@ -583,9 +604,12 @@ def test_simulations_are_identified_one_by_one(simulation: driveby.Simulation) -
             lambda: driveby.simulate(scenario=13),
             "scenario is 13, it must be a whole number from 1 to 12",
         ),
-        (lambda: driveby.simulate(ei=[1.0, 0.5]), "gives 2 elements"),
+        (lambda: driveby.simulate(ei=[1.0, 0.5]), "ei: gives 2 elements"),
         (lambda: driveby.simulate(ei=[0.0] * 7), "ei is 0, it must be from 0.001 to 1000"),
-        (lambda: driveby.simulate(scenario=6, road="F"), 'road is "F"'),
+        (lambda: driveby.simulate(scenario=6, road="F"), f'road is "F", {ROAD}'),
+        (lambda: driveby.simulate(scenario=6, road=np.zeros(9)), f"of shape (9,), {ROAD}"),
+        (lambda: driveby.simulate(scenario=6, road=np.ones((9, 2))), f"of shape (9, 2), {ROAD}"),
+        (lambda: driveby.simulate(scenario=6, road=1.0), f"road is of type float, {ROAD}"),
         (lambda: driveby.simulate(scenario=6, road=([0, 1], [0])), "road has shapes (2,) and (1,)"),
         (lambda: driveby.simulate(scenario=6, road=([0, 0], [0, 1])), "that do not increase"),
         (lambda: driveby.simulate(scenario=6, road=([0, 1], [0, np.nan])), "not finite numbers"),
@@ -641,6 +665,7 @@ def test_wrong_input_gives_one_line(call: Callable[[], object], words: str) -> N
         call()
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+    assert "--" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -697,6 +722,20 @@ def test_fused_bridge_is_that_of_the_command_line(tmp_path: Path) -> None:
     assert again.bridges["bridge-1"].probability_of_loss is not None
     with pytest.raises(driveby.InputError, match="no results given"):
         driveby.fuse()
+
+
+def test_elements_of_a_fusion_are_a_table() -> None:
+    table = driveby.fuse(of_estimates(*[crossing(n) for n in range(3)])).elements()
+    assert list(table.columns) == [
+        *("bridge", "verdict", "crossings", "element", "from_m", "to_m"),
+        *("mean", "std", "q025", "q975", "nominal", "ratio"),
+    ]
+    assert list(table["element"]) == [f"EI_{n}" for n in range(1, 6)]
+    third = table.iloc[2]
+    assert (third["bridge"], third["crossings"]) == ("bridge-1", 3)
+    assert (third["from_m"], third["to_m"]) == (12.0, 18.0)
+    assert third["ratio"] == pytest.approx(third["mean"] / 1.6e10) == pytest.approx(0.6, abs=0.05)
+    assert third["q025"] < third["mean"] < third["q975"]
 
 
 def of_estimates(*crossings: CrossingResult) -> Results:
