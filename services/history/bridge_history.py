@@ -15,6 +15,7 @@ import numpy as np
 
 from schemas.alarms import Alarm
 from services.common.language import ENGLISH, Language
+from services.common.progress import Steps, no_step_progress
 from services.history.alarm_files import alarms_of
 from services.history.history_store import (
     HistoryRow,
@@ -97,9 +98,11 @@ def bridge_history(
     unit: Unit,
     warn: Callable[[str], None],
     now_s: float | None = None,
+    progress: Steps = no_step_progress,
 ) -> BridgeHistory:
     """Read a bridge of a history and fuse its periods; call `warn` with unreadable files.
 
+    `progress` is called after each period.
     The state of its monitoring refers to `now_s`, by default the current time.
     """
     read = read_partition(partition(folder, realm, bridge), ("likelihood", "observation"))
@@ -108,7 +111,7 @@ def bridge_history(
     watch, damaged = monitoring_state(folder, realm, bridge, read.crossings, alarms, now_s)
     for problem in (*read.problems, *problems, *damaged):
         warn(problem)
-    periods = fused_periods(folder, realm, bridge, read.crossings, unit, warn)
+    periods = fused_periods(folder, realm, bridge, read.crossings, unit, warn, progress)
     comparison = None
     if watch.state not in ("watched", "alarm"):
         comparison = _compare_periods(read.crossings, unit)
@@ -207,15 +210,28 @@ def _compare_periods(crossings: Iterable[HistoryRow], unit: Unit) -> PeriodCompa
 
 
 def prefuse_periods(
-    folder: Path, added: Iterable[HistoryEntry], unit: Unit, warn: Callable[[str], None]
+    folder: Path,
+    added: Iterable[HistoryEntry],
+    unit: Unit,
+    warn: Callable[[str], None],
+    progress: Steps = no_step_progress,
 ) -> int:
-    """Fuse the periods to which crossings were added, before they are viewed; return how many."""
+    """Fuse the periods to which crossings were added, before they are viewed; return how many.
+
+    `progress` is called after each period, of all bridges.
+    """
     touched: defaultdict[tuple[str, str], set[float]] = defaultdict(set)
     for crossing in added:
         where = (crossing.realm, crossing.bridge)
         touched[where].add(begin_of(crossing.entry_s, unit))
+    number, before = sum(map(len, touched.values())), 0
     for (realm, bridge), begins in sorted(touched.items()):
         read = read_partition(partition(folder, realm, bridge), ("likelihood",))
         some = [one for one in read.crossings if begin_of(one.entry_s, unit) in begins]
-        fused_periods(folder, realm, bridge, some, unit, warn)
-    return sum(map(len, touched.values()))
+
+        def step(done: int, _: int, before: int = before) -> None:
+            progress(before + done, number)
+
+        fused_periods(folder, realm, bridge, some, unit, warn, step)
+        before += len(begins)
+    return number

@@ -17,6 +17,7 @@ from schemas.results import BridgeResult
 from schemas.settings import IdentificationSettings
 from services.common.errors import FailureError, InputError
 from services.common.files import make_folder, write_atomically
+from services.common.progress import Steps, no_step_progress
 from services.history.history_store import EDITION, HistoryRow, fusable_of
 from services.recordings.recording import program_version
 
@@ -79,11 +80,16 @@ def fused_periods(
     crossings: Iterable[HistoryRow],
     unit: Unit,
     warn: Callable[[str], None] = lambda problem: None,
+    progress: Steps = no_step_progress,
 ) -> list[FusedPeriod]:
-    """Return all periods that have crossings, in order; call `warn` with excluded crossings."""
+    """Return all periods that have crossings, in order; call `warn` with excluded crossings.
+
+    `progress` is called after each period.
+    """
     cache = folder / "fused" / f"realm={realm}" / f"bridge={bridge}"
-    found = []
-    for begin_s, some in by_period(crossings, unit):
+    found: list[FusedPeriod] = []
+    periods = by_period(crossings, unit)
+    for begin_s, some in periods:
         found.append(
             FusedPeriod(
                 begin_s,
@@ -94,6 +100,7 @@ def fused_periods(
                 _fused(cache, bridge, some, warn),
             )
         )
+        progress(len(found), len(periods))
     return found
 
 

@@ -84,11 +84,13 @@ def _add(options: HistoryOptions, paths: list[Path]) -> int:
     for problem in problems:
         print(problem)
     if not options.defer_fusion:
+        from services.common.progress import steps_bar
         from services.execution.blas import one_blas_thread
         from services.history.bridge_history import prefuse_periods
 
-        with a_console().status("fusing what was added"), one_blas_thread():
-            prefuse_periods(options.history, driven, options.period, print)
+        unit = options.period
+        with steps_bar(f"fusing {unit}s", a_console()) as progress, one_blas_thread():
+            prefuse_periods(options.history, driven, unit, print, progress)
     return EXIT_SOMETHING_LOST if problems else 0
 
 
@@ -153,6 +155,7 @@ def _table(options: HistoryOptions) -> int:
 
 def _show(options: HistoryOptions, bridge: str) -> int:
     from services.common.files import check_writable, write_atomically
+    from services.common.progress import steps_bar
     from services.execution.blas import one_blas_thread
     from services.history.bridge_history import bridge_history
     from services.history.history_store import realm_of
@@ -162,9 +165,9 @@ def _show(options: HistoryOptions, bridge: str) -> int:
             check_writable(path)
     folder = options.history
     realm = realm_of(folder, bridge, options.realm)
-    console = a_console()
-    with console.status("fusing crossings"), one_blas_thread():
-        past = bridge_history(folder, realm, bridge, options.period, print)
+    unit = options.period
+    with steps_bar(f"fusing {unit}s", a_console()) as progress, one_blas_thread():
+        past = bridge_history(folder, realm, bridge, unit, print, progress=progress)
     if not past.periods:
         raise InputError(f"{folder}: no crossing of {bridge} can be read")
     for line in _lines(past):

@@ -195,7 +195,12 @@ def test_periods_are_fused_as_fuse_does_it_and_once(
     some = crossings(9)
     add_results(tmp_path, some, {some.crossings[0].crossing_id: 4.0})
     kept = read_partition(where(tmp_path), ("likelihood",)).crossings
-    first, second = fused_periods(tmp_path, "sim-fleet", "bridge-1", kept, "week")
+    steps: list[tuple[int, int]] = []
+    first, second = fused_periods(
+        *(tmp_path, "sim-fleet", "bridge-1", kept, "week"),
+        progress=lambda done, of: steps.append((done, of)),
+    )
+    assert steps == [(1, 2), (2, 2)]
     assert (first.crossings, second.crossings) == (7, 2)
     assert (first.temperature_deg_c, second.temperature_deg_c) == (4.0, None)
     counts = [one for one in map(usable, some.crossings[:7]) if one is not None]
