@@ -156,7 +156,19 @@ def certs_command(asked: CertsSettings) -> list[str]:
         _write_access_control(folder, authority)
     except OSError as error:
         raise FailureError(f"{folder}: {error.strerror}: {error.filename}") from None
-    return _summary(folder, authority)
+    return [*_changes(folder, authority, renewed, revoked), *_summary(folder, authority)]
+
+
+def _changes(
+    folder: Path, authority: _Authority, renewed: Sequence[Subject], revoked: Sequence[Subject]
+) -> Iterator[str]:
+    """Yield a line on each renewed or revoked subject, with what remains to be done."""
+    names = [one.name for one in authority.subjects().values() if one.role in LISTENERS]
+    files = " and ".join(str(folder / name / CONFIGURATION) for name in names)
+    for one in revoked:
+        yield f"{one} is revoked: copy {files} to their machines, restart {' and '.join(names)}"
+    for one in renewed:
+        yield f"{one} is renewed: copy {folder / one.name} to its machine, restart what uses it"
 
 
 def _check_kind(
@@ -434,7 +446,7 @@ def _summary(folder: Path, authority: _Authority) -> list[str]:
         place = f"{name}/" if (folder / name / KEY).exists() else f"({name})"
         lines.append(f"  {place:<20} {subject!s:<28} until {until:%Y-%m-%d}")
     lines.append(
-        f"  {_FOLDER}/{_AUTHORITY_KEY} makes certificates: keep it off line. "
-        "Each other folder goes to its machine; restart the processes that listen."
+        f"  {_FOLDER}/{_AUTHORITY_KEY} makes certificates: keep it on a medium that is not "
+        "connected. Each other folder goes to its machine; restart router and logger."
     )
     return lines

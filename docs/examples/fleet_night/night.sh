@@ -1,8 +1,8 @@
 #!/bin/sh
-# What a timer runs each night: night.sh RECORDINGS SITE.toml TEMPERATURES.csv
+# A timer runs it each night: night.sh RECORDINGS SITE.toml TEMPERATURES.csv [day|week|month]
 # Files of the night are added; nothing is identified or stored twice, so it may be run again.
 set -eu
 driveby catalog "$1"
 driveby identify "$1" --site "$2" --into identified
 driveby history add identified --temperature "$3"
-driveby alarm check --period day
+driveby alarm check --period "${4:-week}"

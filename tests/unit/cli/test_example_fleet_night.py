@@ -36,7 +36,14 @@ def test_nights_after_a_loss_of_stiffness_raise_an_alarm(project: Path, tmp_path
     assert "element 4 is " in done.stdout
     assert list((tmp_path / "figures").glob("*.png"))
     again = subprocess.run(
-        ["sh", name / "night.sh", "recordings", "docs/site.example.toml", "temperatures.csv"],
+        [
+            "sh",
+            name / "night.sh",
+            "recordings",
+            "docs/site.example.toml",
+            "temperatures.csv",
+            "day",
+        ],
         cwd=tmp_path,
         env=os.environ | {"PATH": programs},
         capture_output=True,

@@ -188,6 +188,17 @@ def test_renewal_replaces_one_key_and_keeps_the_hosts(folder: Path) -> None:
     assert sorted(p.name for p in folder.iterdir()) == sorted([*EVERYBODY, "authority"])
 
 
+def test_changes_are_printed_with_what_remains_to_be_done(folder: Path) -> None:
+    lines = certs_command(CertsSettings(folder=folder, revoke=["truck-1"], renew=["worker"]))
+    assert lines[0].startswith("truck/truck-1 is revoked: copy ")
+    for name in ("router", "logger"):
+        assert str(folder / name / "zenoh.json5") in lines[0]
+    assert lines[0].endswith(" to their machines, restart logger and router")
+    own = folder / "worker"
+    assert lines[1] == f"worker/worker is renewed: copy {own} to its machine, restart what uses it"
+    assert not any("revoked" in line for line in certs_command(CertsSettings(folder=folder)))
+
+
 def test_a_revoked_name_is_not_issued_again(folder: Path) -> None:
     certs_command(CertsSettings(folder=folder, revoke=["truck-1"]))
     with pytest.raises(InputError, match="its old key would become valid again"):
