@@ -139,7 +139,7 @@ class Finder:
             truck.ingest_info(message.site_toml)
         elif isinstance(message, AccelBatch):
             truck.boot.add_accel(message)
-            truck.forget(message.device_time_ns * 1e-9)
+            truck.forget(message.device_time_ns * 1e-9, _wall_offset_s(message))
         else:
             # A truck that has restarted sends nothing more of its earlier boots.
             for older in [
@@ -215,7 +215,7 @@ class Finder:
             if truck.late:
                 near = sorted({*near, *truck.due_late_bridges()})
             yield from self._search_stays(truck, near, truck.latest_s, here=fix)
-            truck.forget(truck.latest_s)
+            truck.forget(truck.latest_s, _wall_offset_s(fix))
 
     def _finish(self, truck: TruckBoot) -> Iterator[Found]:
         yield from self._process_fixes(truck, all_there_is=True)
@@ -307,3 +307,8 @@ def _detection(truck: TruckBoot, bridge: Bridge, stay: Stay, crossing_id: str) -
         truck.boot.wall_time_ns(stay.entry_s),
         truck.boot.wall_time_ns(stay.exit_s),
     )
+
+
+def _wall_offset_s(message: AccelBatch | GnssFix) -> float:
+    """Return the wall clock minus the device clock of a message, s."""
+    return (message.wall_time_ns - message.device_time_ns) * 1e-9

@@ -15,6 +15,8 @@ from services.finding.streams import PATIENCE_S, Boot
 
 _log = logging.getLogger(__name__)
 _KEEP_S = 300.0
+_PAUSE_S = 60.0
+"""Change of the wall clock's offset up to which a jump of the device clock is a pause of both."""
 """Age in s from which samples are dropped."""
 _SILENCE_S = 120.0
 """Time in s for which positions may lack accelerations, as when both are fetched later."""
@@ -43,6 +45,8 @@ class TruckBoot:
         self.forgotten_s = -np.inf
         self.clock_s = -np.inf
         """Latest time that more than one message has confirmed."""
+        self.wall_offset_s = 0.0
+        """Wall clock minus device clock at that time, s."""
         self.doubtful_s = -np.inf
         """Time far ahead of it, which only one message has stated yet."""
         self.detected: dict[tuple[str, float], str] = {}
@@ -178,20 +182,31 @@ class TruckBoot:
         end_s = min(window.end_s, latest_s - _ROUNDING_S)
         return self.boot.lacks_accel(window.begin_s - MAX_BATCH_S, end_s)
 
-    def forget(self, now_s: float) -> None:
-        """Drop data that are too old by the truck's own clock, at intervals."""
+    def forget(self, now_s: float, wall_offset_s: float) -> None:
+        """Drop data that are too old by the truck's own clock, at intervals.
+
+        `wall_offset_s` is the wall clock minus the device clock of the message.
+        """
         self.began_s = min(self.began_s, now_s)
         if now_s > self.clock_s + _KEEP_S and abs(now_s - self.doubtful_s) > _KEEP_S:
             # A single wrong time must not make the truck drop, and never accept again, everything
             # older.
             if np.isfinite(self.clock_s):
-                name = self.vehicle.id
-                _log.warning("%s: device time jumped ahead by %.0f s", name, now_s - self.clock_s)
+                self._log_jump(now_s - self.clock_s, wall_offset_s - self.wall_offset_s)
             self.doubtful_s = now_s
             return
         self.clock_s = max(self.clock_s, now_s)
+        self.wall_offset_s = wall_offset_s
         if now_s - _KEEP_S > max(self.began_s, self.forgotten_s) + FORGET_EVERY_S:
             self.forget_before(now_s - _KEEP_S)
+
+    def _log_jump(self, ahead_s: float, change_s: float) -> None:
+        """Log a jump of the device clock, by which the wall clock's offset from it changed."""
+        name = self.vehicle.id
+        if abs(change_s) < _PAUSE_S:
+            _log.info("%s: measured nothing for %.0f s (a pause, or --skip-gaps)", name, ahead_s)
+        else:
+            _log.warning("%s: device time jumped ahead by %.0f s", name, ahead_s)
 
     def forget_before(self, time_s: float) -> None:
         """Drop samples, fixes and decided crossings: no stay is detected there again."""

@@ -1,5 +1,6 @@
 """A run of the worker's deciding part that goes on from what earlier runs said."""
 
+import logging
 from collections.abc import Iterable
 
 import numpy as np
@@ -395,3 +396,14 @@ def test_one_batch_from_far_ahead_costs_no_crossing(
     (result,) = [o.result for o in fed_all_alone(changed) if o.result]
     assert result.verdict == "good"
     assert ("truck-1: device time jumped ahead" in caplog.text) == (number > 0)
+
+
+def test_pause_of_both_clocks_is_no_warning(caplog: pytest.LogCaptureFixture) -> None:
+    """As between two runs of a recording that are published with --skip-gaps."""
+    caplog.set_level(logging.INFO)
+    messages = messages_of(*THERE, (600.0, 640.0))
+    first, rest = messages[:50], [m for m in messages if m.log_time_ns * 1e-9 - START_S > 500.0]
+    fed_all_alone([*first, *rest])
+    (line,) = [one for one in caplog.records if "measured nothing for" in one.getMessage()]
+    assert line.levelno == logging.INFO
+    assert "jumped ahead" not in caplog.text
