@@ -25,6 +25,7 @@ from services.bus.publisher import Publisher
 from services.bus.session import wait_for_router
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable, lock_folder
+from services.common.naming import count_of
 from services.execution.hang_watchdog import TaskLimits
 from services.execution.offline import header_of
 from services.execution.processes import ProcessExecutor
@@ -98,6 +99,7 @@ def _run(asked: WorkerSettings, search: Search, ready: Callable[[], None] | None
         )
         bus = wait_for_router(asked.address, asked.tls, stop.is_set)
         if bus is None:
+            _log.info("stopped by a signal before a router answered")
             return 0
         stack.enter_context(bus)
         publisher = Publisher(bus, asked.realm)
@@ -126,6 +128,7 @@ def _run(asked: WorkerSettings, search: Search, ready: Callable[[], None] | None
             files.abandon()
             raise FailureError(f"{asked.address}: the connection to the bus failed, see the log")
         files.finish()
+    _log.info("stopped by a signal; %s in this run", count_of(service.verdicts.total(), "result"))
     return 0
 
 

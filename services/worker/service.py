@@ -115,7 +115,7 @@ class WorkerService:
         self.process_outputs(finished)
         if earlier.previous is not None:
             _log.info(
-                "%d messages of earlier runs, the last in %s; republished %d, finished %d",
+                "%d messages of earlier runs, the last in %s; republished %d, completed %d pending",
                 *(len(earlier.published), earlier.previous, len(again), len(finished)),
             )
         waited = [

@@ -78,6 +78,7 @@ def test_what_the_readme_says_happens(endpoint: str, project: Path, tmp_path: Pa
         for name in ("watch", "worker", "logger"):
             started[name].send_signal(signal.SIGINT)
             assert started[name].wait(timeout=LONGEST_S) == 0, seen(name)
+        assert "stopped by a signal; 1 result in this run" in seen("worker")
     recorded = [*(tmp_path / "recordings/sim-first").glob("*/truck-1-*.mcap")]
     streams = {m.key.stream for path in recorded for m in read_messages(path)}
     assert {"accel", "gnss", "info", "estimate"} <= streams

@@ -302,6 +302,7 @@ def test_a_signal_ends_a_worker_that_waits_for_a_router(
     os.kill(process.pid, signal.SIGTERM)
     _, log = process.communicate(timeout=LONGEST_S)
     assert process.returncode == 0, log
+    assert "stopped by a signal before a router answered" in log
 
 
 def test_results_that_exist_are_left_alone(site: Path, endpoint: str, tmp_path: Path) -> None:
