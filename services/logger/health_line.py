@@ -19,7 +19,7 @@ def health_line(figures: Mapping[str, float]) -> str:
     known = defaultdict(float, figures)
     why = ""
     if known["lag_s"] > _LONG_LAG_S:
-        why = " (samples so old when they came: played faster than real, sent late, or a clock off)"
+        why = " (old samples: replayed faster than real time, sent late, or a clock is wrong)"
     return (
         f"{count_of(known['trucks_alive'], 'truck')}, {known['rate_per_s']:.0f} messages/s, "
         f"lag {known['lag_s']:.2f} s{why}, queue {known['queue']:.0f}, lost {known['lost']:.0f}, "

@@ -346,16 +346,16 @@ class _Copier:
 
 def describe(recovery: Recovery) -> str:
     """Return the result of a recovery in one line."""
-    lost = "an unknown number" if recovery.lost is None else f"{recovery.lost:,}"
+    lost = "an unknown number of" if recovery.lost is None else f"{recovery.lost:,}"
     parts = [f"{recovery.messages:,} messages recovered"]
     if recovery.is_lossy:
-        parts.append(f"{lost} lost")
+        parts.append(f"{lost} messages lost")
     if recovery.missing_numbers:
         parts.append(f"{recovery.missing_numbers:,} numbers missing from the sequences")
     if recovery.damaged_places:
         places = "1 place" if recovery.damaged_places == 1 else f"{recovery.damaged_places} places"
         parts.append(f"{recovery.damaged_bytes:,} of {recovery.bytes:,} bytes damaged in {places}")
-    parts += ["cut off, without END"] if recovery.is_cut_off else []
+    parts += ["the file ends without its summary"] if recovery.is_cut_off else []
     return ", ".join(parts)
 
 

@@ -203,8 +203,8 @@ def _log_timing(times: _DriveTiming) -> None:
     if times.ahead_ns > _OLD_S * NS_PER_S:
         begins = datetime.fromtimestamp(time.time() - times.ahead_ns * 1e-9, UTC)
         _log.info(
-            "times are shifted so that the drive ends when all is published: it begins at %s UTC, "
-            "its first samples are %.0f s old when published",
+            "all times are shifted so that the drive ends as its publication does: it begins at %s "
+            "UTC, its first samples are %.0f s old when they are published",
             *(f"{begins:%Y-%m-%d %H:%M:%S}", times.ahead_ns * 1e-9),
         )
 

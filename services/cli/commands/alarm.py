@@ -167,8 +167,8 @@ def _print_watches(folder: Path) -> None:
 
 def _how_many_monitored(monitored: int, bridges: int) -> str:
     if bridges == 1:
-        return "the only bridge is monitored" if monitored else "the only bridge is not monitored"
-    return f"{monitored} of {bridges} bridges monitored"
+        return f"the bridge is {'' if monitored else 'not '}monitored"
+    return f"{monitored} of {bridges} bridges are monitored"
 
 
 def _acknowledge(options: AlarmOptions, bridge: str) -> int:

@@ -154,5 +154,5 @@ def test_list_of_alarms_of_a_single_bridge(
     capsys.readouterr()
     assert cli.main(["alarm", "list", "--history", str(tmp_path / "history")]) == 0
     first, second, third = capsys.readouterr().out.splitlines()
-    assert (first, second) == ("no alarms", "the only bridge is not monitored")
+    assert (first, second) == ("no alarms", "the bridge is not monitored")
     assert third.startswith("bridge-1 in realm sim-fleet: Not monitored: ")

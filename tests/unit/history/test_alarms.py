@@ -274,7 +274,7 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     never = "driveby alarm check has not been run on this bridge."
     assert capsys.readouterr().out.splitlines() == [
         "no alarms",
-        "0 of 2 bridges monitored",
+        "0 of 2 bridges are monitored",
         f"bridge-1 in realm sim-fleet: Not monitored: {never}",
         f"bridge-2 in realm sim-fleet: Not monitored: {never}",
     ]
@@ -285,7 +285,7 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     how = "then acknowledge the alarm: driveby alarm ack BRIDGE --by NAME --note TEXT\n"
     assert output.endswith(how)
     assert "\nan alarm compares periods; identify and fuse combine all crossings" in output
-    assert "\n2 of 2 bridges monitored\n" in output
+    assert "\n2 of 2 bridges are monitored\n" in output
     assert cli.main(["alarm", "list", *there]) == 0
     assert capsys.readouterr().out.endswith(how)
     assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", "--note", "props", *there]) == 0
