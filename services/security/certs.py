@@ -165,10 +165,10 @@ def _changes(
     """Yield a line on each renewed or revoked subject, with what remains to be done."""
     names = [one.name for one in authority.subjects().values() if one.role in LISTENERS]
     files = " and ".join(str(folder / name / CONFIGURATION) for name in names)
-    for one in revoked:
-        yield f"{one} is revoked: copy {files} to their machines, restart {' and '.join(names)}"
-    for one in renewed:
-        yield f"{one} is renewed: copy {folder / one.name} to its machine, restart what uses it"
+    todo = f"copy {files} to their machines, restart {' and '.join(names)}"
+    yield from (f"{one} is revoked: {todo}" for one in revoked)
+    todo = "to its machine, restart what uses it"
+    yield from (f"{one} is renewed: copy {folder / one.name} {todo}" for one in renewed)
 
 
 def _check_kind(
@@ -445,8 +445,5 @@ def _summary(folder: Path, authority: _Authority) -> list[str]:
         until = issued[name].not_valid_after_utc
         place = f"{name}/" if (folder / name / KEY).exists() else f"({name})"
         lines.append(f"  {place:<20} {subject!s:<28} until {until:%Y-%m-%d}")
-    lines.append(
-        f"  {_FOLDER}/{_AUTHORITY_KEY} makes certificates: keep it on a medium that is not "
-        "connected. Each other folder goes to its machine; restart router and logger."
-    )
-    return lines
+    own = f"  {_FOLDER}/{_AUTHORITY_KEY} makes certificates: keep it on an unconnected medium. "
+    return [*lines, f"{own}Each other folder goes to its machine; restart router and logger."]
