@@ -273,9 +273,9 @@ def update_noise(
 
 
 def replace_mismatch(
-    problem: PosteriorProblem, y: FloatArray, mismatch: Mismatch, runs: float = 1.0
+    problem: PosteriorProblem, y: FloatArray, mismatch: Mismatch | None, runs: float = 1.0
 ) -> PosteriorProblem:
-    """Return the problem with another mismatch in its noise at y (size,), gradient included.
+    """Return the problem with another mismatch, or none, in its noise at y (size,).
 
     The noise by the axle ahead of a tandem has `runs` times its power.
     """

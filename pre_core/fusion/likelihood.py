@@ -142,9 +142,11 @@ def likelihood(found: Optimum, *, with_bends: bool = True) -> CrossingLikelihood
     state = found.state
     grid, inner = np.zeros(0), np.zeros(0, dtype=np.int64)
     differs = bool(problem.mismatch.level_m3.any())
-    if differs:
-        problem = replace_mismatch(problem, y, _short_waves(problem.mismatch), front_axle.RUNS)
+    if differs or posterior.has_tandem(problem):
+        short = _short_waves(problem.mismatch) if differs else None
+        problem = replace_mismatch(problem, y, short, front_axle.RUNS)
         state = levenberg_marquardt.initial_state(lambda at: posterior.all_rows(problem, at), y)
+    if differs:
         grid, inner = _knots(problem, y)
     bridge = where.bridge
     truck = np.concatenate(

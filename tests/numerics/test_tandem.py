@@ -12,6 +12,7 @@ import pytest
 
 from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import front_axle, posterior
+from pre_core.crossing.fit import Optimum
 from pre_core.crossing.mismatch import BridgePavement, tapered_periodogram
 from pre_core.crossing.noise import no_suspension_noise
 from pre_core.crossing.off_bridge import _levels_off_bridge, off_bridge_residuals
@@ -24,6 +25,7 @@ from pre_core.crossing.preparation import (
 )
 from pre_core.crossing.rows import RESIDUALS
 from pre_core.crossing.tandem_friction import tandem_friction
+from pre_core.fusion.likelihood import likelihood
 from pre_core.parameters import (
     C_S1,
     C_U1,
@@ -41,6 +43,8 @@ from pre_core.parameters import (
 from pre_core.physics.surface import Footprint
 from pre_core.physics.tandem import NO_LEAD, Lead, friction_passage, shared_load
 from pre_core.physics.vehicle import masses_above_axles
+from pre_core.search import levenberg_marquardt
+from pre_core.search.loop import Termination
 from services.simulation.two_sided import WideTruck, axle_row, body_row, static_axle_loads_n
 from services.simulation.wide_crossings import (
     SatelliteErrors,
@@ -464,3 +468,20 @@ def test_front_axle_counts_for_each_run_in_a_fusion() -> None:
     assert np.sum(many**2) > 1.2 * np.sum(one**2)
     problem, y = build_problem(inputs_of(driven())._replace(lead=NO_LEAD))
     assert problem.front_axle is None
+
+
+def test_front_axle_counts_for_each_run_without_mismatch_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem, y = on_a_surface()
+    assert not problem.mismatch.level_m3.any()
+    rows = levenberg_marquardt.initial_state(lambda at: posterior.all_rows(problem, at), y)
+    found = Optimum(problem, rows, Termination.CONVERGED, 1.0, 0, 1)
+
+    def information() -> float:
+        of = likelihood(found)
+        return float(np.sum(of.root[:, : len(of.bridge.names)] ** 2))
+
+    of_many = information()
+    monkeypatch.setattr(front_axle, "RUNS", 1.0)
+    assert of_many < 0.8 * information()
