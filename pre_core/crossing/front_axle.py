@@ -53,11 +53,11 @@ class FrontAxleResponse(NamedTuple):
 
     columns: FloatArray
     """Residuals (3, m, K) in m for an acceleration of 1 m/s² at each knot."""
-    by_model: FloatArray
-    """Residuals (3, m, d) in m for a standard deviation of each value of the axle."""
     covariance: FloatArray
     """Covariance (K, K) in m²/s^4 of the acceleration's error at the knots, where the surface under
     the axle is as rough as off the bridge."""
+    of_values: FloatArray
+    """The same (K, K) by the displaced values of the axle, for its nominal mass."""
 
 
 def front_axle_response(problem: PosteriorProblem, y: FloatArray) -> FrontAxleResponse | None:
@@ -76,11 +76,12 @@ def front_axle_response(problem: PosteriorProblem, y: FloatArray) -> FrontAxleRe
     for k in range(motions.shape[1]):
         moved = crossing._replace(lead_acceleration=crossing.lead_acceleration + motions[:, k])
         columns[:, :, k] = filtered_rows(problem._replace(crossing=moved), y) - base
-    by_model = _of_displaced_leads(problem, y, base.shape)
-    if not (columns.size and np.isfinite(columns).all() and np.isfinite(by_model).all()):
+    if not (columns.size and np.isfinite(columns).all()):
         return None
-    covariance = _covariance(problem, surface, apart_s, columns.shape[2])
-    return FrontAxleResponse(columns, by_model, covariance)
+    count = columns.shape[2]
+    covariance = _covariance(problem, surface, apart_s, count)
+    of_values = _of_displaced_values(problem, y, apart_s, count)
+    return FrontAxleResponse(columns, covariance, of_values)
 
 
 def front_axle_power(
@@ -93,11 +94,11 @@ def front_axle_power(
     """
     taper = hann_taper(some.size)[:, None]
     of_knots = np.fft.rfft(taper * response.columns[0, some], axis=0)[1:]
-    of_values = np.fft.rfft(taper * response.by_model[0, some], axis=0)[1:]
-    by_surface = np.einsum(
-        "fk,kl,fl->f", of_knots, response.covariance, of_knots.conj(), optimize=True
+    by_surface, by_values = (
+        np.einsum("fk,kl,fl->f", of_knots, covariance, of_knots.conj(), optimize=True).real
+        for covariance in (response.covariance, response.of_values)
     )
-    return by_surface.real, np.sum(np.abs(of_values) ** 2, axis=1)
+    return by_surface, by_values
 
 
 def without_front_axle(
@@ -113,10 +114,10 @@ def without_front_axle(
     noise = noise._replace(low_rank=np.zeros((0, 0)))
     if response is None:
         return noise
-    covariance = response.covariance.copy()
+    covariance = pavement_ratio(problem.mismatch) ** 2 * response.covariance + response.of_values
     covariance[np.diag_indices_from(covariance)] *= 1.0 + _JITTER
-    root = pavement_ratio(problem.mismatch) * cholesky(covariance, lower=True)
-    forced = np.concatenate([response.columns @ root, response.by_model], axis=2)
+    root = cholesky(covariance, lower=True)
+    forced = response.columns @ root
     forced = np.sqrt(runs) * np.moveaxis(forced, 0, 1).reshape(-1, forced.shape[2])
     rows = np.ascontiguousarray(forced.T)
     for row in rows:
@@ -151,18 +152,29 @@ def _unit_motions(problem: PosteriorProblem, y: FloatArray) -> tuple[FloatArray,
     return out, apart_s
 
 
-def _of_displaced_leads(
-    problem: PosteriorProblem, y: FloatArray, shape: tuple[int, ...]
+def _of_displaced_values(
+    problem: PosteriorProblem, y: FloatArray, apart_s: float, count: int
 ) -> FloatArray:
-    """Return the change (3, m, d) of the residuals (3, m) by each displaced front axle."""
-    out = np.empty((*shape, len(problem.displaced_leads)))
-    if not problem.displaced_leads:
-        return out
-    nominal = filtered_rows(with_lead_motion(problem, y), y)
-    for k, lead in enumerate(problem.displaced_leads):
-        moved = problem._replace(crossing=problem.crossing._replace(lead=lead))
-        out[:, :, k] = filtered_rows(with_lead_motion(moved, y), y) - nominal
-    return out
+    """Return the covariance (K, K) in m²/s^4 at `count` knots by the displaced values.
+
+    The error of the inertia force that each causes is known but for its factor. It is treated as
+    random with the spectrum that it has in the record: it contains the sensors' noise, which is in
+    the residuals too, and as columns of the noise the errors would bias the estimate. What a
+    displaced mass changes in the loads of the body is left to the unknown place of its centre.
+    """
+    lead = problem.crossing.lead
+    nominal = with_lead_motion(problem, y).crossing.lead_acceleration
+    n = nominal.size
+    hz = np.fft.fftfreq(n, problem.crossing.step_s)
+    power = np.zeros(n)
+    for one in problem.displaced_leads:
+        moved = problem._replace(crossing=problem.crossing._replace(lead=one))
+        motion = with_lead_motion(moved, y).crossing.lead_acceleration
+        force = one.unsprung_mass_kg / lead.unsprung_mass_kg * motion
+        power += np.abs(np.fft.fft(force - nominal)) ** 2 / n**2
+    some = np.abs(hz) < 0.5 / apart_s
+    lags_s = apart_s * np.arange(count)
+    return np.asarray(toeplitz(np.cos(2.0 * np.pi * np.outer(lags_s, hz[some])) @ power[some]))
 
 
 def _covariance(

@@ -68,8 +68,8 @@ def estimate_pavement(
     part = _periodogram(problem, y, road, middle)
     known, shape = part.sensors, part.shapes[0]
     if front_axle is not None:
-        by_surface, by_model = front_axle_power(front_axle, middle)
-        known, shape = known + by_model, shape + by_surface
+        by_surface, by_values = front_axle_power(front_axle, middle)
+        known, shape = known + by_values, shape + by_surface
     length_m = middle.size * (rows.every * rows.step_s) * road.speed_m_per_s
     n = np.arange(1, part.seen.size + 1) / length_m
     low, high = _SHORT_CYCLES_PER_M
