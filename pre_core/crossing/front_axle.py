@@ -17,7 +17,7 @@ and the roughness of the deck (`pavement.estimate_pavement`): the bridge's respo
 short as that roughness, and would be mistaken for it. In the few bands in which the bridge
 responds, the noise is many times that of the sensors; it would be mistaken for damping or for
 support springs. All runs over one lane have the same e, so that it does not average out: in a
-fusion its power counts `RUNS` times.
+fusion its power counts `RUNS` times. Errors of the axle's mass and tyre add to the covariance.
 """
 
 from typing import Final, NamedTuple
