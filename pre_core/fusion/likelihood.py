@@ -137,15 +137,10 @@ def likelihood(found: Optimum, *, with_bends: bool = True) -> CrossingLikelihood
 
     Without `with_bends` it has no curvature terms, offset and response to short waves.
     """
-    problem, y = found.problem, found.state.y
-    where = posterior.layout(problem)
-    state = found.state
+    problem, state = _in_fusion(found)
+    y, where = state.y, posterior.layout(problem)
     grid, inner = np.zeros(0), np.zeros(0, dtype=np.int64)
     differs = bool(problem.mismatch.level_m3.any())
-    if differs or posterior.has_tandem(problem):
-        short = _short_waves(problem.mismatch) if differs else None
-        problem = replace_mismatch(problem, y, short, front_axle.RUNS)
-        state = levenberg_marquardt.initial_state(lambda at: posterior.all_rows(problem, at), y)
     if differs:
         grid, inner = _knots(problem, y)
     bridge = where.bridge
@@ -194,6 +189,23 @@ def likelihood(found: Optimum, *, with_bends: bool = True) -> CrossingLikelihood
         bends,
         _response_to_short_waves(found) if differs and with_bends else None,
     )
+
+
+def _in_fusion(
+    found: Optimum,
+) -> tuple[posterior.PosteriorProblem, levenberg_marquardt.LMState]:
+    """Return problem and state at an optimum with the noise of a run among others.
+
+    Long waves of the mismatch are parameters, and the noise by a tandem's front axle is shared.
+    """
+    problem, y = found.problem, found.state.y
+    differs = bool(problem.mismatch.level_m3.any())
+    if not (differs or posterior.has_tandem(problem)):
+        return problem, found.state
+    short = _short_waves(problem.mismatch) if differs else None
+    problem = replace_mismatch(problem, y, short, front_axle.RUNS)
+    state = levenberg_marquardt.initial_state(lambda at: posterior.all_rows(problem, at), y)
+    return problem, state
 
 
 def _with_mismatch_bias(
