@@ -61,7 +61,7 @@ def with_coefficients(table: Any) -> Any:
     return rest | dict(zip(_COEFFICIENTS, rayleigh_of(*values), strict=True))
 
 
-def implied_first_frequency_hz(table: dict[str, Any]) -> float | None:
+def _single_span_frequency_hz(table: dict[str, Any]) -> float | None:
     """Return the first natural frequency of a single span by its EI and mass; None if unknown."""
     known = [table.get(key) for key in ("flexural_rigidity_nm2", *_MASS_AND_SPAN)]
     if table.get("interior_supports_m") or not all(
@@ -74,7 +74,7 @@ def implied_first_frequency_hz(table: dict[str, Any]) -> float | None:
 
 def _check_frequency(table: dict[str, Any], first_hz: float) -> None:
     """Raise FieldError where a single span of this EI and mass has quite another frequency."""
-    implied_hz = implied_first_frequency_hz(table)
+    implied_hz = _single_span_frequency_hz(table)
     if implied_hz is None or 1.0 / _FAR < first_hz / implied_hz < _FAR:
         return
     key, rigidity = "flexural_rigidity_nm2", table["flexural_rigidity_nm2"]

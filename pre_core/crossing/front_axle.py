@@ -173,8 +173,7 @@ def _of_displaced_values(
         force = one.unsprung_mass_kg / lead.unsprung_mass_kg * motion
         power += np.abs(np.fft.fft(force - nominal)) ** 2 / n**2
     some = np.abs(hz) < 0.5 / apart_s
-    lags_s = apart_s * np.arange(count)
-    return np.asarray(toeplitz(np.cos(2.0 * np.pi * np.outer(lags_s, hz[some])) @ power[some]))
+    return np.asarray(toeplitz(_turns(apart_s, count, hz[some]) @ power[some]))
 
 
 def _covariance(
@@ -186,8 +185,13 @@ def _covariance(
     """
     highest_hz = 0.5 / apart_s
     hz = highest_hz * (np.arange(_OVERSAMPLED * count) + 0.5) / (_OVERSAMPLED * count)
-    turns = np.cos(2.0 * np.pi * np.outer(apart_s * np.arange(count), hz)) * (hz[1] - hz[0])
+    turns = _turns(apart_s, count, hz) * (hz[1] - hz[0])
     return np.asarray(toeplitz(turns @ _acceleration_power(problem, surface, hz)))
+
+
+def _turns(apart_s: float, count: int, hz: FloatArray) -> FloatArray:
+    """Return the factors (K, f) from a power spectrum to the covariance at lags of the knots."""
+    return np.asarray(np.cos(2.0 * np.pi * np.outer(apart_s * np.arange(count), hz)))
 
 
 def _acceleration_power(problem: PosteriorProblem, surface: float, hz: FloatArray) -> FloatArray:

@@ -4,7 +4,6 @@ No bus, no terminal, no clock: the time is given with each message.
 """
 
 from collections import deque
-from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -23,6 +22,7 @@ from schemas.results_on_the_wire import estimate_to_crossing, state_to_bridge
 from schemas.signals import decode_accel, decode_gnss
 from services.bus.realm_listener import BusMessage
 from services.common.errors import one_line
+from services.common.language import utc_second
 from services.common.naming import count_of
 from services.identification.comparison import Comparison, compare, estimate_of_state
 from services.viewer.crossing_view import (
@@ -315,8 +315,7 @@ def route_text(row: CrossingRow) -> str:
 
 def _named(row: CrossingRow) -> str:
     """Return a crossing's direction and entry time, which distinguish it in a log."""
-    entry = datetime.fromtimestamp(row.entry_ns * 1e-9, UTC)
-    return f"{route_text(row)}, entry {entry:%Y-%m-%d %H:%M:%S}"
+    return f"{route_text(row)}, entry {utc_second(row.entry_ns * 1e-9)}"
 
 
 def _weight(alarm: Alarm) -> tuple[bool, float]:

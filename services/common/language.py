@@ -136,6 +136,11 @@ def utc_day(time_s: float) -> str:
     return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"
 
 
+def utc_second(time_s: float) -> str:
+    """Return a time in s since 1970 UTC to the second, such as 2026-07-01 09:30:00."""
+    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d %H:%M:%S}"
+
+
 def _flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     """Return the sentences of nested tables, by dotted keys."""
     found: dict[str, str] = {}

@@ -33,18 +33,16 @@ class TaskLimits(NamedTuple):
     start_processor_s: float = LIMIT_S
     """Limit of processor time of the start, before the task."""
 
-    def during(self, starts: bool) -> "TaskLimits":
-        """Return the limits of the start or, if the process has started, of its task."""
-        return self._replace(processor_s=self.start_processor_s) if starts else self
-
 
 class HangWatchdog:
     """Watchdog of a process during its start or one task."""
 
-    def __init__(self, pid: int, limits: TaskLimits, now_s: float) -> None:
-        """Begin to watch; `now_s` is the time by any steady clock."""
+    def __init__(self, pid: int, limits: TaskLimits, now_s: float, *, starts: bool = False) -> None:
+        """Begin to watch a start or a task; `now_s` is the time by any steady clock."""
+        self.starts = starts
         self._pid = pid
-        self._limits = limits
+        self._processor_s = limits.start_processor_s if starts else limits.processor_s
+        self._most_idle_s = limits.idle_s
         self._checked_s = now_s
         self._began = self._used_s = processor_time_s(pid)
         self._idle_s = 0.0
@@ -58,10 +56,10 @@ class HangWatchdog:
             return ""
         self._idle_s = 0.0 if used_s != self._used_s else self._idle_s + step_s
         self._used_s = used_s
-        if used_s - self._began > self._limits.processor_s:
-            return f"has taken more than {self._limits.processor_s:g} s of processor time"
-        if self._idle_s > self._limits.idle_s:
-            return f"has done nothing for {self._limits.idle_s:g} s"
+        if used_s - self._began > self._processor_s:
+            return f"has taken more than {self._processor_s:g} s of processor time"
+        if self._idle_s > self._most_idle_s:
+            return f"has done nothing for {self._most_idle_s:g} s"
         return ""
 
 

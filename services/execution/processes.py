@@ -357,9 +357,8 @@ class _Slot:
             return
         self._next_check_s = now_s + _CHECK_EVERY_S
         starts = self.job is None or not self.is_warm.done()
-        if self._watchdog is None or starts != self._watches_start:
-            self._watchdog = HangWatchdog(self._pid, self._limits.during(starts), now_s)
-            self._watches_start: bool = starts
+        if self._watchdog is None or starts != self._watchdog.starts:
+            self._watchdog = HangWatchdog(self._pid, self._limits, now_s, starts=starts)
         why = self._watchdog.why_hung(now_s)
         if why:
             self._next_check_s = math.inf

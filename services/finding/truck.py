@@ -15,9 +15,9 @@ from services.finding.streams import PATIENCE_S, Boot
 
 _log = logging.getLogger(__name__)
 _KEEP_S = 300.0
+"""Age in s from which samples are dropped."""
 _PAUSE_S = 60.0
 """Change of the wall clock's offset up to which a jump of the device clock is a pause of both."""
-"""Age in s from which samples are dropped."""
 _SILENCE_S = 120.0
 """Time in s for which positions may lack accelerations, as when both are fetched later."""
 FORGET_EVERY_S = 10.0

@@ -15,7 +15,6 @@ from services.common.errors import InputError
 from services.common.progress import Offset, no_progress
 from services.drives.importing import normalised_runs, vehicle_of
 from services.drives.runs import run_to_messages
-from services.drives.tables.guesses import check_folder_hint
 from services.finding.drive import DriveMessages, drives_of
 from services.finding.streams import Boot, Fixes, Samples, boot_of
 from services.recordings.recording import read_messages
@@ -76,13 +75,23 @@ def recorded_runs(
     return [_recorded(str(path), drive) for drive in drives]
 
 
+def _with_way(error: str, folder: Path) -> str:
+    """Return an error of reading a folder; where it names options of an import, with the way."""
+    if not any(option in error for option in ("--zone", "--map", "--start", "--yes")):
+        return error
+    return (
+        f"{error}; driveby check has none of these options: driveby import {folder} "
+        "--site SITE.toml -o DRIVE.mcap with them, then driveby check DRIVE.mcap"
+    )
+
+
 def _of_folder(folder: Path, site: Site, site_name: str) -> Iterator[Message]:
     """Yield the messages as `driveby import` would read them; the check judges the rates."""
     vehicle_id = vehicle_of(site, site_name, None)
     try:
         runs = normalised_runs([folder], site, site_name, vehicle_id, checks_rate=False)
     except InputError as error:
-        raise InputError(check_folder_hint(str(error), folder)) from error
+        raise InputError(_with_way(str(error), folder)) from error
     return run_to_messages(runs, site, _REALM, vehicle_id)
 
 

@@ -22,7 +22,7 @@ from services.identification.comparison import baseline_cautions
 from services.notebook.arguments import file_of, known_arguments, path_of
 from services.notebook.read import Name, given_site
 from services.notebook.showing import RIGIDITY_HEAD, html_table, rigidity_cells
-from services.notebook.solution import Identification
+from services.notebook.solution import Identification, element_rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -70,21 +70,16 @@ class Fusion(NamedTuple):
         return pd.DataFrame(rows, columns=_COLUMNS)
 
     def _element_rows(self, name: str) -> Iterator[dict[str, object]]:
-        state, of, start_m = self.bridges[name], self.elements_of[name], 0.0
-        lengths = zip(of.lengths_m, of.nominal_flexural_rigidity_nm2, strict=True)
-        for number, (length_m, nominal) in enumerate(lengths, start=1):
-            one = state.elements.get(f"EI_{number}")
-            found = {key: float(getattr(one, key, np.nan)) for key in _STATISTICS}
-            identity: dict[str, object] = {
-                "bridge": name,
-                "verdict": state.verdict,
-                "crossings": len(state.crossings_used),
-                "element": f"EI_{number}",
-                "from_m": start_m,
-                "to_m": start_m + length_m,
-            }
-            yield identity | found | {"nominal": nominal, "ratio": found["mean"] / nominal}
-            start_m += length_m
+        state, of = self.bridges[name], self.elements_of[name]
+        used = len(state.crossings_used)
+        identity: dict[str, object] = {"bridge": name, "verdict": state.verdict, "crossings": used}
+
+        def statistics(element: str) -> dict[str, float]:
+            one = state.elements.get(element)
+            return {key: float(getattr(one, key, np.nan)) for key in _STATISTICS}
+
+        for row in element_rows(of.lengths_m, of.nominal_flexural_rigidity_nm2, statistics):
+            yield identity | row
 
     def site_with(self, bridges: Iterable[str]) -> Site:
         """Return the site file; raise InputError without one that has all these bridges."""

@@ -3,7 +3,8 @@
 pandas and xarray are needed only by the functions that return their types.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -197,21 +198,29 @@ def _elements_of(solutions: "list[Solution] | tuple[Solution, ...]") -> "pd.Data
 
     rows: list[dict[str, object]] = []
     for solution in solutions:
-        bridge, start_m = solution.bridge, 0.0
+        bridge, identity_of = solution.bridge, _identity_columns(solution)
         nominal = bridge.nominal_flexural_rigidity_nm2
-        for number, (length_m, sound) in enumerate(zip(bridge.lengths_m, nominal, strict=True)):
-            name = f"EI_{number + 1}"
-            found = _statistics(solution, solution.value.get(name))
-            rows.append(
-                _identity_columns(solution)
-                | {"element": name, "from_m": start_m, "to_m": start_m + length_m}
-                | found
-                | {"nominal": sound, "ratio": found["mean"] / sound}
-            )
-            start_m += length_m
+        statistics = partial(_element_statistics, solution)
+        of_elements = element_rows(bridge.lengths_m, nominal, statistics)
+        rows += [identity_of | row for row in of_elements]
     identity = ("crossing", "bridge", "vehicle", "method", "verdict")
     columns = [*identity, "element", "from_m", "to_m", *_STATISTICS, "nominal", "ratio"]
     return pd.DataFrame(rows, columns=columns)
+
+
+def element_rows(
+    lengths_m: Sequence[float],
+    nominal_nm2: Sequence[float],
+    statistics: Callable[[str], dict[str, float]],
+) -> Iterator[dict[str, object]]:
+    """Yield the columns of each element: place, `statistics` of its name, nominal value, ratio."""
+    start_m = 0.0
+    for number, (length_m, sound) in enumerate(zip(lengths_m, nominal_nm2, strict=True), start=1):
+        name, stop_m = f"EI_{number}", start_m + length_m
+        found = statistics(name)
+        place: dict[str, object] = {"element": name, "from_m": start_m, "to_m": stop_m}
+        yield place | found | {"nominal": sound, "ratio": found["mean"] / sound}
+        start_m = stop_m
 
 
 def _parameters_of(solutions: "list[Solution] | tuple[Solution, ...]") -> "pd.DataFrame":
@@ -238,6 +247,10 @@ def _identity_columns(solution: Solution) -> dict[str, object]:
         "method": crossing.method,
         "verdict": crossing.verdict,
     }
+
+
+def _element_statistics(solution: Solution, name: str) -> dict[str, float]:
+    return _statistics(solution, solution.value.get(name))
 
 
 def _statistics(solution: Solution, value: Parameter | None) -> dict[str, float]:

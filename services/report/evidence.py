@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from datetime import UTC, datetime
 from typing import NamedTuple
 
 import matplotlib
 
 from schemas.results import CrossingResult, is_torsion_declared
-from services.common.language import Language
+from services.common.language import Language, utc_second
 from services.report.bridge import BridgeReport, reasons_of
 from services.report.html import Html, inlined_svg, joined, table, tag
 from services.report.measurement import sensor_lines, truck_line, vehicles_of
@@ -77,11 +76,6 @@ def road_of(crossing: CrossingResult, language: Language) -> str | None:
     return ", ".join(parts) or None
 
 
-def moment(seconds: float) -> str:
-    """Return a time in UTC, to the second."""
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S}"
-
-
 def _what_measured(report: BridgeReport, language: Language) -> Html:
     vehicles = vehicles_of(report.site, report.crossings)
     trucks = "; ".join(truck_line(vehicle, language) for vehicle in vehicles)
@@ -95,7 +89,7 @@ def _what_measured(report: BridgeReport, language: Language) -> Html:
         (language.text("fact.sensors"), sensors),
         (language.text("fact.road"), _newest_road(report.crossings, language)),
         (language.text("fact.source"), f"{files}; {programs}"),
-        (language.text("fact.computed"), f"{moment(report.computed_s)} UTC"),
+        (language.text("fact.computed"), f"{utc_second(report.computed_s)} UTC"),
     ]
     return facts([row for row in rows if row[1]])
 
@@ -124,7 +118,7 @@ def _crossings(report: BridgeReport, numbered: Sequence[Numbered], language: Lan
         rows.append(
             [
                 str(number),
-                moment(crossing.entry_time),
+                utc_second(crossing.entry_time),
                 crossing.vehicle,
                 language.text("crossings.way_cell", start=start, end=end),
                 language.number(crossing.speed_m_per_s, ".1f"),

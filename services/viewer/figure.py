@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from schemas.reasons import Reason
 from services.common.arrays import Floats
 from services.common.language import ENGLISH
+from services.identification.result_parts import detrended
 from services.viewer.crossing_view import (
     VEHICLE_COLOURS,
     CrossingView,
@@ -244,7 +245,7 @@ def _without_line(x_m: Floats, mean_m: Floats, truth: tuple[Floats, Floats]) -> 
     error = mean_m - np.interp(x_m, *truth, left=np.nan, right=np.nan)
     known = np.isfinite(error)
     if known.sum() > 2:
-        error -= np.polynomial.Polynomial.fit(x_m[known], error[known], 1)(x_m)
+        error[known] = detrended(x_m[known], error[known])
     return error
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from datetime import UTC, datetime
 
 from schemas.results import CrossingResult
 from schemas.site import Site
 from services.catalogue.contents import RecordingSummary, TruckSummary
+from services.common.language import utc_second
 from services.finding.bridges import DetectedCrossing
 from services.finding.placed import sensors_in_words
 from services.finding.stays import MERGE_S, Passage
@@ -115,7 +115,7 @@ def _state(found: RecordingSummary) -> str:
 
 
 def _moment(time_ns: int) -> str:
-    return f"{datetime.fromtimestamp(time_ns * _S, UTC):%Y-%m-%d %H:%M:%S}"
+    return utc_second(time_ns * _S)
 
 
 def _length(seconds: float) -> str:

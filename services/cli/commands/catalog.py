@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -133,7 +132,9 @@ def _print_crossings(found: "CatalogScan") -> None:
 
 
 def _time(time_ns: int) -> str:
-    return f"{datetime.fromtimestamp(time_ns / _NS_PER_S, UTC):%Y-%m-%d %H:%M:%S}"
+    from services.common.language import utc_second
+
+    return utc_second(time_ns / _NS_PER_S)
 
 
 COMMAND: Final = Subcommand(

@@ -1,7 +1,6 @@
 """Guesses by which files are read, and their lines: equal ones of several files are one."""
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
 GuessKind = Literal["form", "lost", "open", "converts"]
@@ -36,13 +35,3 @@ def conversions(guesses: Iterable[Guess]) -> list[str]:
 
 def _named(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
-
-
-def check_folder_hint(error: str, folder: Path) -> str:
-    """Return an error of reading a folder; where it names options of an import, with the way."""
-    if not any(option in error for option in ("--zone", "--map", "--start", "--yes")):
-        return error
-    return (
-        f"{error}; driveby check has none of these options: driveby import {folder} "
-        "--site SITE.toml -o DRIVE.mcap with them, then driveby check DRIVE.mcap"
-    )

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from services.common.arrays import Floats
+from services.common.language import utc_second
 from services.common.naming import count_of
 from services.drives.runs import Run, grid_index
 from services.drives.tables.guesses import grouped
@@ -52,7 +53,8 @@ def _of_run(run: Run, width: int) -> list[str]:
     curves |= {"speed m/s": gnss.speed_m_per_s}
     label = max(len(name) for name in curves)
     head = (
-        f"{run.source}: {_day(run.accel_time_s[0])}, {seconds:.1f} s at {run.rate_hz:g} Hz, "
+        f"{run.source}: {utc_second(float(run.accel_time_s[0]))} UTC, "
+        f"{seconds:.1f} s at {run.rate_hz:g} Hz, "
         f"{count_of(gaps, 'gap')}, {gnss.time_s.size} fixes"
     )
     return [
@@ -84,7 +86,3 @@ def _curve(name: str, values: Floats, width: int) -> str:
 
 def _clock(time_s: float) -> str:
     return f"{datetime.fromtimestamp(round(float(time_s), 6), UTC):%H:%M:%S.%f}"
-
-
-def _day(time_s: float) -> str:
-    return f"{datetime.fromtimestamp(float(time_s), UTC):%Y-%m-%d %H:%M:%S} UTC"
