@@ -83,6 +83,8 @@ class Boot:
         self._ahead_ns: dict[int, int] = {}
         """Lead of the wall clock by the known fixes, cached as messages repeat the same times."""
         self._forgotten_ns = -1
+        self._kept_from = 0
+        """Sequence of the first batch that is not older than that, as far as known."""
         self._first_accel = self._first_fix = (1 << 64, 0)
         """Sequence and time of the earliest message received."""
         self._channels: set[str] = set()
@@ -95,6 +97,8 @@ class Boot:
             # A truck that names other channels in every batch must not fill the memory.
             if len(self._channels) <= _MAX_NAMES:
                 self._channels.update(batch.channels)
+        else:
+            self._kept_from = max(self._kept_from, batch.sequence + 1)
 
     def add_fix(self, fix: GnssFix) -> bool:
         """Add a fix, known after `release_fixes`; ignore a duplicate.
@@ -150,6 +154,7 @@ class Boot:
         self._forgotten_ns = limit_ns
         for sequence in [s for s, b in self._batches.items() if b.device_time_ns < limit_ns]:
             del self._batches[sequence]
+            self._kept_from = max(self._kept_from, sequence + 1)
         self._fixes = [(s, f) for s, f in self._fixes if f.device_time_ns >= limit_ns]
         self._ahead_ns.clear()
         known_s = self.fixes().time_s
@@ -174,7 +179,7 @@ class Boot:
                 break
         if stop < 0:
             return True
-        begin = max(begin, 0)
+        begin = max(begin, self._kept_from)
         return sum(begin <= sequence <= stop for sequence in ordered) != stop - begin + 1
 
     def wall_time_ns(self, time_s: float) -> int:

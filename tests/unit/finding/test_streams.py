@@ -339,6 +339,18 @@ def test_what_may_still_come_is_known_by_the_sequence(
     assert boot_with(present).lacks_accel(7 * 3600 + start_s, 7 * 3600 + stop_s) is lacks
 
 
+def test_forgotten_batches_are_not_missing_behind_a_pause() -> None:
+    """A window may begin in the pause between two runs, before the first batch that is kept."""
+    boot = boot_with(batches_of(np.arange(1000.0)))
+    boot.forget_before(START_NS / NS + 300.0)
+    for k in range(20, 40):
+        boot.add_accel(batch(k, 600.0 + 0.05 * (k - 20), {"sprung_front": (1000.0, np.zeros(50))}))
+    begin_s = START_NS / NS + 599.0
+    assert not boot.lacks_accel(begin_s, begin_s + 1.5)
+    boot.add_accel(batch(42, 601.1, {"sprung_front": (1000.0, np.zeros(50))}))
+    assert boot.lacks_accel(begin_s, begin_s + 2.12)
+
+
 def test_the_latest_sample() -> None:
     assert Boot().latest_accel_s() == -np.inf
     ordered = batches_of(np.arange(500.0))
