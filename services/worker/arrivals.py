@@ -1,6 +1,7 @@
 """Order and time in which messages from the bus are processed. No I/O, no clock."""
 
 from collections import defaultdict
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from schemas.topics import Key, is_from_recording, topic
@@ -17,7 +18,7 @@ _LOST_AFTER_S = 120.0
 A token is also lost when only the connection is; a truck that returns sends the missing data.
 """
 _HISTORY_S = 1.0
-"""Least time in s over which the history of a new truck is collected.
+"""Least time in s over which the history of a new or returned truck is collected.
 
 It sends its history stream by stream, in pieces that a busy machine delays: all is sorted by time
 before it is processed.
@@ -70,13 +71,18 @@ _Vehicle = tuple[str, str]
 
 
 class _History:
-    """Messages of a new truck, collected until none of those that it still keeps are missing."""
+    """Messages of a new or returned truck, collected until none that it still keeps is missing.
 
-    def __init__(self, began_s: float) -> None:
+    `known` holds the highest sequence received before by stream, up to which none is waited for.
+    """
+
+    def __init__(self, began_s: float, known: Mapping[str, int]) -> None:
         self.messages: list[TruckMessage] = []
         self._began_s = self._grew_s = began_s
         self._sequences: defaultdict[str, Intervals] = defaultdict(Intervals)
         """Received sequences by stream."""
+        for stream, highest in known.items():
+            self._sequences[stream].add_range(0, highest)
 
     def add(self, message: TruckMessage) -> None:
         self.messages.append(message)
@@ -101,13 +107,13 @@ class _History:
         A boot's sequences begin at 0, and a truck keeps as many as `cache` in the table of topics.
         A replay may begin anywhere.
         """
-        key = self.messages[0].key
+        realm = self.messages[0].key.realm
         return any(
             sequences.runs > 1
             or (
                 sequences.contiguous_from_zero is None
                 and sequences.size < topic("vehicle", stream).cache
-                and not is_from_recording(key.realm)
+                and not is_from_recording(realm)
             )
             for stream, sequences in self._sequences.items()
         )
@@ -122,7 +128,12 @@ class ArrivalQueue:
 
     def __init__(self) -> None:
         self._known: set[_Name] = set()
+        """Boots whose messages are processed at once."""
+        self._highest: defaultdict[_Name, dict[str, int]] = defaultdict(dict)
+        """Highest sequence received by stream."""
         self._new: dict[_Name, _History] = {}
+        self._away: set[_Vehicle] = set()
+        """Trucks that left: those that return send what they measured meanwhile."""
         self._alive: set[_Vehicle] = set()
         self._leaves: dict[_Vehicle, _Leave] = {}
         self._lost: dict[_Vehicle, float] = {}
@@ -131,19 +142,29 @@ class ArrivalQueue:
     def add(self, message: TruckMessage) -> list[TruckMessage]:
         """Add a message; return it if it can be processed now."""
         truck = (message.key.realm, message.key.identifier)
+        self._note_return(truck)
         if truck not in self._alive:
             self._leaves[truck] = _Leave(message.received_s, _SILENT_S)
             self._lost.pop(truck, None)
-        name = (message.key.realm, message.key.identifier, message.boot_id)
-        if name in self._known:
-            return [message]
-        self._new.setdefault(name, _History(message.received_s)).add(message)
-        return []
+        name = (*truck, message.boot_id)
+        highest = self._highest[name]
+        if name not in self._known:
+            self._new.setdefault(name, _History(message.received_s, highest)).add(message)
+        stream = message.key.stream
+        highest[stream] = max(highest.get(stream, 0), message.sequence)
+        return [message] if name in self._known else []
+
+    def _note_return(self, truck: _Vehicle) -> None:
+        """Collect a history of a truck that left and is back, as of a new one."""
+        if truck in self._away:
+            self._away.remove(truck)
+            self._known = {name for name in self._known if name[:2] != truck}
 
     def note(self, token: LivenessToken) -> None:
         """Record that a truck arrived or departed."""
         truck = (token.realm, token.vehicle)
         if token.is_alive:
+            self._note_return(truck)
             self._alive.add(truck)
             self._leaves.pop(truck, None)
             self._lost.pop(truck, None)
@@ -152,7 +173,7 @@ class ArrivalQueue:
             self._leaves[truck] = _Leave(token.received_s, GONE_AFTER_S)
 
     def due(self, now_s: float) -> list[TruckMessage]:
-        """Return the messages of new trucks' histories that are complete, in order of time.
+        """Return the messages of trucks' histories that are complete, in order of time.
 
         Nothing is waited for behind a truck that has left.
         """
@@ -170,6 +191,7 @@ class ArrivalQueue:
         """Return the trucks found to have left since the last call."""
         gone = self._departed(now_s)
         lost = [truck for truck, lost_s in self._lost.items() if lost_s <= now_s]
+        self._away.update(gone)
         for truck in gone:
             self._lost[truck] = self._leaves.pop(truck).since_s + _LOST_AFTER_S
         for truck in lost:

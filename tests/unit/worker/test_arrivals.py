@@ -132,6 +132,39 @@ def test_history_of_a_truck_that_has_left_is_processed_before_its_departure() ->
     assert arrivals.gone(5.0) == [gone()]
 
 
+def test_messages_of_a_returned_truck_are_put_in_order_of_time() -> None:
+    """It sends stream by stream what it measured meanwhile, minutes of each."""
+    arrivals = ArrivalQueue()
+    arrivals.note(token(0.0, is_alive=True))
+    before = numbered(0.0, 0)
+    arrivals.add(before)
+    assert arrivals.due(1.0) == [before]
+    arrivals.note(token(2.0, is_alive=False))
+    assert arrivals.gone(5.0) == [gone()]
+    arrivals.note(token(600.0, is_alive=True))
+    burst = [numbered(600.0, n) for n in (5, 3, 4, 2)]
+    for one in burst:
+        assert arrivals.add(one) == []
+    assert arrivals.due(601.0) == []  # 1 is missing, and 0 came before
+    first = numbered(601.0, 1)
+    assert arrivals.add(first) == []
+    assert arrivals.due(601.0) == sorted([*burst, first], key=lambda one: one.sequence)
+    now = numbered(602.0, 6)
+    assert arrivals.add(now) == [now]
+
+
+def test_messages_of_a_truck_whose_link_was_short_of_a_moment_are_not_held_up() -> None:
+    arrivals = ArrivalQueue()
+    arrivals.note(token(0.0, is_alive=True))
+    arrivals.add(numbered(0.0, 0))
+    assert len(arrivals.due(1.0)) == 1
+    arrivals.note(token(2.0, is_alive=False))
+    assert arrivals.gone(4.0) == []
+    arrivals.note(token(4.0, is_alive=True))
+    now = numbered(4.0, 1)
+    assert arrivals.add(now) == [now]
+
+
 def test_what_is_malformed_is_looked_at_all_the_same() -> None:
     arrivals = ArrivalQueue()
     broken = message(0.0)._replace(payload=b"\xff\xff")
