@@ -33,7 +33,7 @@ from pre_core.arrays import FloatArray
 from pre_core.crossing import mismatch as _mismatch
 from pre_core.crossing.channels import GainsAndDelays
 from pre_core.crossing.mismatch import Mismatch
-from pre_core.crossing.rows import RESIDUALS, RowFilter, phases
+from pre_core.crossing.rows import RESIDUALS, RowFilter, autocovariances
 from pre_core.crossing.suspension_noise import (
     FORCE_SHAPES,
     REDUCED_WEIGHT_FACTOR,
@@ -309,9 +309,7 @@ def mismatch_power(
             return np.moveaxis(_estimation(trucks[k], omega) * channel, 2, 0)
 
         inverse = np.linalg.inv(estimation(0))
-        of_all = omega**4 * power * _mismatch.spectrum(road, omega)
-        of_front = omega**4 * power * _mismatch.front_cross_spectrum(road, omega)
-        of_rear = of_front - of_all  # rear profile with d
+        of_front, of_rear = (omega**4 * power * one for one in _mismatch.cross_spectra(road, omega))
         turn = np.exp(s * wheelbase_m / road.speed_m_per_s)
         out = np.empty((len(trucks) - 1, RESIDUALS, omega.size), dtype=np.complex128)
         for number in range(len(out)):
@@ -347,12 +345,12 @@ def mismatch_levels(
     residuals of one axle's profile there, treated as the front one, which bound an axle's offset.
     """
     omega, shapes = rows.omega, road.shapes
-    table = np.concatenate([shapes.density, shapes.road[None, :]])
-    shape = omega**4 * _mismatch.density_at(road, omega, table) * rows.power
-    longest_s = max(stretch.size for stretch in stretches) * rows.every * rows.step_s
-    turn = phases(rows, min(_mismatch.correlation_time_s(road), longest_s))
+    table = np.concatenate([_mismatch.unwindowed(shapes), shapes.road[None, :]])
     sensors = noise_spectrum(truck, density, no_suspension_noise(), None, omega)[0, 0].real
-    of_sensors, of_shapes = ((sensors * rows.power) @ turn).real, (shape @ turn).real
+    spectra = np.vstack([sensors, omega**4 * _mismatch.density_at(road, omega, table)])
+    longest = max(stretch.size for stretch in stretches)
+    covariances = autocovariances(rows, spectra, longest)
+    of_sensors, of_shapes = covariances[0], covariances[1:]
     whole = [_mismatch.tapered_periodogram(one, of_sensors, of_shapes[-1:]) for one in roads]
     metres = rows.every * rows.step_s * road.speed_m_per_s
     surface = _mismatch.surface_level(shapes, whole, [metres * one.size for one in roads])

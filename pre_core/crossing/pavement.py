@@ -23,7 +23,7 @@ from pre_core.crossing.mismatch import BridgePavement, Mismatch, PeriodogramSegm
 from pre_core.crossing.noise import no_suspension_noise, noise_spectrum
 from pre_core.crossing.off_bridge import FEWEST_ROWS, rear_axle_chainage_m, rear_axle_samples_m
 from pre_core.crossing.posterior import PosteriorProblem, filtered_rows, noise_path_at
-from pre_core.crossing.rows import RESIDUALS, filter_rows, phases
+from pre_core.crossing.rows import RESIDUALS, autocovariances, filter_rows
 from pre_core.crossing.whitening import Whitener, solve
 
 RATIO_SPREAD, TILT_SPREAD = 0.7, 0.12
@@ -83,15 +83,13 @@ def _periodogram(
 ) -> PeriodogramSegment:
     """Return the periodogram of successive mismatch residuals `some` (m,), as on the road."""
     rows, omega = problem.rows, problem.rows.omega
-    density = road.level_m3 @ _mismatch.density_at(road, omega, road.shapes.density)
+    table = _mismatch.unwindowed(road.shapes)
+    density = omega**4 * (road.level_m3 @ _mismatch.density_at(road, omega, table))
     truck, sensor = noise_path_at(problem, y)
     of_sensors = noise_spectrum(truck, sensor, no_suspension_noise(), None, omega)[0, 0].real
-    memory = min(_mismatch.correlation_time_s(road), some.size * (rows.every * rows.step_s))
-    turn = phases(rows, memory)
+    covariances = autocovariances(rows, np.stack([of_sensors, density]), some.size)
     return _mismatch.tapered_periodogram(
-        filtered_rows(problem, y)[0, some],
-        ((of_sensors * rows.power) @ turn).real,
-        ((omega**4 * density * rows.power) @ turn).real[None, :],
+        filtered_rows(problem, y)[0, some], covariances[0], covariances[1:]
     )
 
 

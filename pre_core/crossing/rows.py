@@ -82,6 +82,16 @@ def filter_adjoint(rows: RowFilter, y: FloatArray, samples: int) -> FloatArray:
     return out
 
 
+def autocovariances(rows: RowFilter, spectra: FloatArray, lags: int) -> FloatArray:
+    """Return autocovariances (…, lags) of filtered residuals from spectra (…, f) of accelerations.
+
+    The spectra are one-sided, at the frequencies of `rows`.
+    """
+    apart_s = rows.every * rows.step_s
+    waves = np.cos(np.outer(rows.omega * apart_s, np.arange(lags)))
+    return np.asarray((spectra * rows.power) @ waves)
+
+
 def phases(rows: RowFilter, memory_s: float) -> NDArray[np.complex128]:
     """Return phases (f, lags) between residuals, for noise of correlation time `memory_s` in s."""
     if memory_s == 0.0:
