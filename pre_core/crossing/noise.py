@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 
 from pre_core.arrays import FloatArray
 from pre_core.crossing import mismatch as _mismatch
-from pre_core.crossing.channels import GainsAndDelays
 from pre_core.crossing.mismatch import Mismatch
 from pre_core.crossing.rows import RESIDUALS, RowFilter, autocovariances
 from pre_core.crossing.suspension_noise import (
@@ -50,8 +49,6 @@ _SOURCES = 6  # s1, s2, u1, u2; and the other body sensor at the front's and at 
 _FEW_FREQUENCIES = 48
 """Midpoints of even intervals up to half the residuals' rate, for a trace that is computed
 repeatedly."""
-_MANY_FREQUENCIES = 512
-"""Number of frequencies that resolves the phase between the axles."""
 _MIDDLE_BAND, _TOP_BAND = (0.22, 0.54), (0.65, 0.757)
 """Bands relative to half the residuals' rate: 12 to 30 and 36 to 42 Hz for sensors of 250 Hz and
 more."""
@@ -123,7 +120,7 @@ def no_suspension_noise() -> FloatArray:
     return np.zeros((2, FORCE_SHAPES))
 
 
-def _estimation(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex128]:
+def estimation_matrix(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex128]:
     """Return the truck's equations as factors of its accelerations: (4, 4, f).
 
     Rows are s² times the input profiles R_1, R_2 and the body equations; columns s1, s2, u1, u2.
@@ -156,7 +153,7 @@ def _estimation(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex128]:
 
 def _responses(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex128]:
     """Return the response (3, 6, f) from the noise of six sources to displacement residuals."""
-    estimation = _estimation(truck, omega)
+    estimation = estimation_matrix(truck, omega)
     if not truck.lead.is_equalised:
         return tandem.sensor_responses(estimation)
     out = np.zeros((RESIDUALS, _SOURCES, omega.size), dtype=np.complex128)
@@ -224,7 +221,7 @@ def _suspension_noise_spectra(truck: NoisePath, force: FloatArray, omega: FloatA
     return np.asarray((force @ force_shapes(omega)) * omega**4 / over**2)
 
 
-class _AliasedBands(NamedTuple):
+class AliasedBands(NamedTuple):
     """Bands up to half the rate of the residuals, and those that alias to them."""
 
     below: FloatArray
@@ -233,7 +230,8 @@ class _AliasedBands(NamedTuple):
     power_above: FloatArray
 
 
-def _folded(rows: RowFilter, count: int) -> _AliasedBands:
+def folded(rows: RowFilter, count: int) -> AliasedBands:
+    """Return bands of `count` frequencies."""
     half = 0.5 / (rows.every * rows.step_s)
     step = 2.0 * np.pi * half / count
     below = step * (np.arange(count, dtype=np.float64) + 0.5)
@@ -241,11 +239,11 @@ def _folded(rows: RowFilter, count: int) -> _AliasedBands:
     power_below, power_above = (
         np.interp(omega, rows.omega, rows.power) for omega in (below, above)
     )
-    return _AliasedBands(below, above, power_below, power_above)
+    return AliasedBands(below, above, power_below, power_above)
 
 
-def _folded_spectrum(
-    at: _AliasedBands,
+def folded_spectrum(
+    at: AliasedBands,
     truck: NoisePath,
     density: FloatArray,
     force: FloatArray,
@@ -272,57 +270,12 @@ def noise_power(
     `which` (w,) counts from the second truck on; `density` is (trucks, 4), `force` (2, shapes). The
     spectra are those of an endless record of residuals, aliased at half their rate.
     """
-    at = _folded(rows, _FEW_FREQUENCIES)
-    folded = partial(_folded_spectrum, at, force=force, road=road)
-    first = np.linalg.inv(folded(trucks[0], density[0]))
+    spectrum = partial(folded_spectrum, folded(rows, _FEW_FREQUENCIES), force=force, road=road)
+    first = np.linalg.inv(spectrum(trucks[0], density[0]))
     traces = [
-        np.einsum("fij,fji->", first, folded(trucks[1 + k], density[1 + k])).real for k in which
+        np.einsum("fij,fji->", first, spectrum(trucks[1 + k], density[1 + k])).real for k in which
     ]
     return np.asarray(traces) / _FEW_FREQUENCIES - RESIDUALS
-
-
-def mismatch_power(
-    rows: RowFilter,
-    trucks: list[NoisePath],
-    channels: GainsAndDelays,
-    density: FloatArray,
-    force: FloatArray,
-    road: Mismatch,
-    wheelbase_m: float,
-) -> FloatArray:
-    """Return E[r' C_0^-1 (r_k - r)] per residual sample by the mismatch alone: (trucks - 1,).
-
-    The wheels respond to their own profiles, so that the mismatch is both in the residuals and in
-    the accelerations: errors in variables, which would bias towards trucks that respond less to it.
-    With r the residuals of the first truck and r_k those of another, each with its `channels`, E =
-    M_k M_0^-1 - 1 describes how the latter mixes the input profiles, which differ by d; the front
-    axle's residuals are taken when its wheel was at the rear's present place.
-    """
-    at = _folded(rows, _MANY_FREQUENCIES)
-
-    def crossed(omega: FloatArray, power: FloatArray) -> NDArray[np.complex128]:
-        """(w, 3, f): E[(r_k - r)_l conj(r_0)], of which r_0, the mismatch, is d itself."""
-        s = 1j * omega
-
-        def estimation(k: int) -> NDArray[np.complex128]:
-            channel = (1.0 + channels.gain[k])[:, None] * np.exp(np.outer(channels.delay_s[k], s))
-            return np.moveaxis(_estimation(trucks[k], omega) * channel, 2, 0)
-
-        inverse = np.linalg.inv(estimation(0))
-        of_front, of_rear = (omega**4 * power * one for one in _mismatch.cross_spectra(road, omega))
-        turn = np.exp(s * wheelbase_m / road.speed_m_per_s)
-        out = np.empty((len(trucks) - 1, RESIDUALS, omega.size), dtype=np.complex128)
-        for number in range(len(out)):
-            e = np.moveaxis(estimation(1 + number) @ inverse, 0, 2) - np.eye(4)[:, :, None]
-            out[number, 0] = of_front * (e[0, 0] - turn * e[1, 0])
-            out[number, 0] += of_rear * (turn.conj() * e[0, 1] - e[1, 1])
-            out[number, 1] = of_front * e[2, 0] + of_rear * turn.conj() * e[2, 1]
-            out[number, 2] = of_front * turn * e[3, 0] + of_rear * e[3, 1]
-        return out
-
-    weight = np.linalg.inv(_folded_spectrum(at, trucks[0], density, force, road))[:, 0]
-    both = crossed(at.below, at.power_below) + crossed(at.above, at.power_above).conj()
-    return np.einsum("fl,wlf->w", weight, both).real / _MANY_FREQUENCIES
 
 
 def mismatch_levels(

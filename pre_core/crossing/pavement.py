@@ -13,6 +13,8 @@ A joint at an end of the deck excites both axles; only local waves differ. Where
 an end exceed the noise, all local waves there are removed from the whitened residuals.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -135,15 +137,24 @@ def fit_ratio(
     return found, np.linalg.inv(information)
 
 
-def parts_of(road: Mismatch, count: int) -> list[tuple[Mismatch, float]]:
-    """Return the mismatch off and on the bridge, each with its share of `count` residuals."""
+class RoadPart(NamedTuple):
+    """A part of the residuals with its mismatch."""
+
+    mismatch: Mismatch
+    residuals: float
+    """Number of residuals."""
+    is_bridge: bool
+
+
+def parts_of(road: Mismatch, count: int) -> list[RoadPart]:
+    """Return the parts off and on the bridge of `count` residuals; one if all roads are alike."""
     pavement = road.pavement
     if pavement is None:
-        return [(road, float(count))]
+        return [RoadPart(road, float(count), False)]
     on = float(pavement.share.sum())
     return [
-        (road._replace(pavement=None), count - on),
-        (_mismatch.on_bridge(road), on),
+        RoadPart(road._replace(pavement=None), count - on, False),
+        RoadPart(_mismatch.on_bridge(road), on, True),
     ]
 
 

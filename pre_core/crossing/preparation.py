@@ -10,6 +10,7 @@ from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import lines
 from pre_core.crossing.arguments import EvaluationPoints, GriddedCrossing, allocate_buffers
 from pre_core.crossing.channels import A, GainsAndDelays, ModelSignals, channel_signals
+from pre_core.crossing.errors_in_variables import ComparedStretch, mismatch_power
 from pre_core.crossing.front_axle import (
     FrontAxleResponse,
     front_axle_response,
@@ -20,7 +21,6 @@ from pre_core.crossing.mismatch import BridgePavement, Mismatch, mismatch_spectr
 from pre_core.crossing.noise import (
     FRICTION_STATISTIC,
     NoisePath,
-    mismatch_power,
     no_suspension_noise,
     noise_path,
     noise_power,
@@ -251,15 +251,11 @@ def update_noise(
     profile_noise = road if differs else None
     noise = whitener(problem.rows, count, trucks[0], density[0], residual_force, profile_noise)
     noise = _with_local_noise(problem._replace(mismatch=road), y, noise, front_axle)
-    truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
-    changing = [*range(truck), *range(where.wheelbase, unknowns)]
-    slope = np.zeros(unknowns)
-    for part, number in parts_of(road, count) if differs else [(None, float(count))]:
-        power = noise_power(problem.rows, trucks, density, residual_force, changing, part)
-        slope[changing] += 0.5 * number * power / _SLOPE_STEP
+    changed = problem._replace(force=force, mismatch=road)
+    slope = _noise_gradient(changed, trucks, density)
     if differs:
         slope = np.concatenate([slope, np.zeros(where.delays.stop - unknowns)])
-        slope += mismatch_gradient(problem._replace(force=force, mismatch=road), y)
+        slope += mismatch_gradient(changed, y)
     basis = change_basis(problem.crossing.basis, at.theta[0])
     for work in problem.works:
         work.modes_of[:] = np.nan
@@ -270,6 +266,25 @@ def update_noise(
         noise_slope=slope,
         crossing=problem.crossing._replace(basis=basis, is_inertial=bool(force.any())),
     )
+
+
+def _noise_gradient(
+    problem: PosteriorProblem, trucks: list[NoisePath], density: FloatArray
+) -> FloatArray:
+    """Return half the gradient (n,) of tr(C_0^-1 C) over truck, wheelbase and gains.
+
+    `trucks` and `density` (1 + n, 4) are those of `_displaced_points`.
+    """
+    where, road = layout(problem), problem.mismatch
+    truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
+    changing = [*range(truck), *range(where.wheelbase, where.gains.stop)]
+    force = REDUCED_WEIGHT_FACTOR * problem.force
+    slope = np.zeros(where.gains.stop)
+    for part in parts_of(road, row_count(problem.rows, problem.crossing.rows)):
+        profile_noise = part.mismatch if road.level_m3.any() else None
+        power = noise_power(problem.rows, trucks, density, force, changing, profile_noise)
+        slope[changing] += 0.5 * part.residuals * power / _SLOPE_STEP
+    return slope
 
 
 def replace_mismatch(
@@ -373,29 +388,33 @@ def _displaced_points(
 
 def mismatch_gradient(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
     """Return the part of the gradient at `y` (size,) that the mismatch causes, shape (n,)."""
-    where = layout(problem)
+    where, crossing = layout(problem), problem.crossing
     is_inertial = bool(problem.force.any())
     at, trucks = _displaced_points(problem, y, where.delays.stop, is_inertial=is_inertial)
+    estimated = problem.priors.estimated
+    truck = int(estimated[:FIRST_OF_BRIDGE].sum())
     changing = [
-        *range(int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())),
+        *range(truck),
         *range(where.wheelbase, where.gains.stop),
         *range(where.delays.start, where.delays.stop),
     ]
+    if estimated[TORSION]:
+        changing.append(int(estimated[:TORSION].sum()))
     some = [0, *(1 + k for k in changing)]
     channels = GainsAndDelays(at.gain[some], at.delay_s[some])
     slope = np.zeros(where.delays.stop)
-    count = row_count(problem.rows, problem.crossing.rows)
-    for part, number in parts_of(problem.mismatch, count):
+    count = row_count(problem.rows, crossing.rows)
+    for part in parts_of(problem.mismatch, count):
+        deck = crossing.torsion if part.is_bridge else NO_TORSION
         power = mismatch_power(
             problem.rows,
             [trucks[k] for k in some],
             channels,
             problem.density * (1.0 + at.gain[0]),
             REDUCED_WEIGHT_FACTOR * problem.force,
-            part,
-            float(at.wheelbase_m[0]),
+            ComparedStretch(part.mismatch, float(at.wheelbase_m[0]), deck),
         )
-        slope[changing] += number * power / _SLOPE_STEP
+        slope[changing] += part.residuals * power / _SLOPE_STEP
     return slope
 
 

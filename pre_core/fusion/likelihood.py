@@ -153,7 +153,7 @@ def likelihood(found: Optimum, *, with_bends: bool = True) -> CrossingLikelihood
     # The correction of the gradient is in the rows of the priors, which are excluded.
     slope = np.zeros(centre.size + grid.size)
     slope[: problem.noise_slope.size] = problem.noise_slope
-    slope[np.setdiff1d(np.arange(slope.size), truck)] = 0.0
+    slope[np.setdiff1d(np.arange(slope.size), kept)] = 0.0
     bends = None
     if differs:
         splines = np.zeros((rows.size, grid.size))

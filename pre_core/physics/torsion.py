@@ -20,9 +20,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.arrays import FloatArray
+from pre_core.arrays import ComplexArray, FloatArray
 from pre_core.kernels.lanes import LANES, inner
-from pre_core.parameters import TORSION
+from pre_core.parameters import ALPHA, BETA, TORSION
 from pre_core.physics.beam_basis import modal_damping
 from pre_core.physics.modal_response import COEFFICIENTS, mode_coefficients
 
@@ -91,6 +91,24 @@ def sine_cubics(part_m: FloatArray, span_m: FloatArray, modes: int) -> FloatArra
     return np.stack(
         [value[0], slope[0], 3.0 * rise - 2.0 * slope[0] - slope[1], slope.sum(axis=0) - 2.0 * rise]
     )
+
+
+def mean_receptance(basis: TorsionBasis, theta: FloatArray, omega: FloatArray) -> ComplexArray:
+    """Return the mean receptance (f,) in m/N of a deck under an axle, over its places.
+
+    It is the deflection by a harmonic force on the same place, at angular frequencies (f,), of the
+    modes and the remainder below for `theta` (p,).
+    """
+    squared = (1j * omega) ** 2
+    lengths = np.diff(basis.ends_m, axis=1)[:, 0]
+    total = np.zeros(omega.size, dtype=np.complex128)
+    for length in lengths:
+        wave = np.arange(1, MODES + 1)[:, None] * np.pi / length
+        eigenvalue = (wave * basis.wave_speed_m_per_s) ** 2
+        damping = 1j * omega * (theta[ALPHA] + theta[BETA] * eigenvalue)
+        dynamic = basis.wave_speed_m_per_s**2 / (eigenvalue + damping + squared) - wave**-2.0
+        total += length / lengths.sum() * (length / 6.0 + dynamic.sum(axis=0) / length)
+    return theta[TORSION] * basis.load_factor * total
 
 
 @inner

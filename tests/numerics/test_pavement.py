@@ -112,9 +112,11 @@ def test_sensor_noise_alone_leaves_the_prior() -> None:
 
 
 def test_parts_count_all_residuals() -> None:
-    (off, before), (on, bridge) = parts_of(with_pavement(SAME), COUNT)
-    assert before + bridge == pytest.approx(COUNT)
-    assert bridge == pytest.approx(share().sum())
-    assert off.pavement is None
-    assert on.pavement is None
-    assert parts_of(of_level(1e-8), COUNT)[0][1] == COUNT
+    off, on = parts_of(with_pavement(SAME), COUNT)
+    assert off.residuals + on.residuals == pytest.approx(COUNT)
+    assert on.residuals == pytest.approx(share().sum())
+    assert [one.is_bridge for one in (off, on)] == [False, True]
+    assert off.mismatch.pavement is None
+    assert on.mismatch.pavement is None
+    (whole,) = parts_of(of_level(1e-8), COUNT)
+    assert whole.residuals == COUNT

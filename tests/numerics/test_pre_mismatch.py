@@ -10,12 +10,12 @@ from pre_core.arrays import FloatArray
 from pre_core.crossing import mismatch as mm
 from pre_core.crossing.channels import GainsAndDelays
 from pre_core.crossing.compliances import CompliancePosterior, draws
+from pre_core.crossing.errors_in_variables import ComparedStretch, mismatch_power
 from pre_core.crossing.noise import (
     NoisePath,
-    _estimation,
-    _folded,
+    estimation_matrix,
+    folded,
     mismatch_levels,
-    mismatch_power,
     no_suspension_noise,
     noise_path,
     noise_spectrum,
@@ -23,6 +23,7 @@ from pre_core.crossing.noise import (
 from pre_core.crossing.off_bridge import MIN_MISMATCH_STATISTIC
 from pre_core.crossing.rows import RESIDUALS, filter_rows, row_count, row_filter
 from pre_core.crossing.whitening import whitener
+from pre_core.parameters import ALPHA, BETA, M_U1, TORSION
 from pre_core.physics.models import from_models
 from pre_core.physics.road import REFERENCE_CYCLES_PER_M
 from pre_core.physics.surface import (
@@ -33,8 +34,10 @@ from pre_core.physics.surface import (
     spectra,
     surface_density,
 )
+from pre_core.physics.torsion import NO_TORSION, torsion_basis
 from services.simulation.drive import beam_of, paper_site
 from services.simulation.drive import truck_of as car_of
+from tests.numerics.bars import bar_receptance
 from tests.numerics.whitened import white_rows
 
 STEP_S = 3e-3
@@ -43,10 +46,12 @@ FRONT, REAR = TYPICAL_FOOTPRINTS
 QUIET = np.full(4, 1e-6)
 
 
-def truck(change: int | None = None, by: float = 0.0) -> NoisePath:
+def truck(change: int | None = None, by: float = 0.0, flexibility_per_n: float = 0.0) -> NoisePath:
     site = paper_site()
     car = car_of(site.vehicles[0])
     theta = from_models(car, beam_of(site.bridges[0], np.ones(7)))
+    theta[TORSION] = flexibility_per_n
+    theta[BETA] = 1e-4
     if change is not None:
         theta[change] *= 1.0 + by
     return noise_path(theta, site.vehicles[0].total_mass_kg, car.wheelbase_m, False)
@@ -167,12 +172,34 @@ def test_sensors_noise_is_no_mismatch() -> None:
     assert max(gains) < MIN_MISMATCH_STATISTIC
 
 
-@pytest.mark.parametrize("unknown", [3, 5, 7])
+WAVE_M_PER_S = 400.0
+DECK = torsion_basis(np.full(7, 30.0 / 7.0), (), WAVE_M_PER_S)
+
+
+def on_deck(one: NoisePath, omega: FloatArray) -> NDArray[np.complex128]:
+    """Equations (f, 4, 4) of a truck on a deck whose twist each axle's own force causes."""
+    theta = one.theta
+    equations = np.moveaxis(estimation_matrix(one, omega), 2, 0)
+    if not theta[TORSION]:
+        return equations
+    mass = np.array([[one.m_11, one.m_12], [one.m_12, one.m_22]])
+    axles = np.diag([theta[M_U1], theta[M_U1 + 1]])
+    damping = float(theta[ALPHA]), float(theta[BETA])
+    receptance = theta[TORSION] * bar_receptance(np.array([30.0]), WAVE_M_PER_S, damping, omega)
+    equations[:, :2] -= (omega**2 * receptance)[:, None, None] * np.hstack([mass, axles])
+    return equations
+
+
+@pytest.mark.parametrize("unknown", [3, 5, 7, TORSION])
 def test_pull_of_the_mismatch_against_drawn_spectra(unknown: int) -> None:
-    """Rows made of drawn road spectra, with the truck's equations right and 1 % wrong."""
+    """Rows made of drawn road spectra, with the truck's equations right and 1 % wrong.
+
+    The last case is a deck that twists, and whose flexibility is wrong.
+    """
     rows, level = row_filter(STEP_S), true_level("A")
     road = of_level(level)
-    right, wrong = truck(), truck(unknown, 0.01)
+    deck, flexibility = (DECK, 3e-9) if unknown == TORSION else (NO_TORSION, 0.0)
+    right, wrong = truck(None, 0.0, flexibility), truck(unknown, 0.01, flexibility)
     wheelbase = paper_site().vehicles[0].wheelbase_m
     expected_power = mismatch_power(
         rows,
@@ -180,10 +207,9 @@ def test_pull_of_the_mismatch_against_drawn_spectra(unknown: int) -> None:
         GainsAndDelays(np.zeros((2, 4)), np.zeros((2, 4))),
         QUIET,
         no_suspension_noise(),
-        road,
-        wheelbase,
+        ComparedStretch(road, wheelbase, deck),
     )[0]
-    omega = _folded(rows, 4000).below
+    omega = folded(rows, 4000).below
     n = omega / (2.0 * np.pi * SPEED)
     at = surface_density("A")
     s_11, s_22, s_12, _ = (at * s for s in spectra(FRONT, REAR, np.maximum(n, 1e-3)))
@@ -201,9 +227,7 @@ def test_pull_of_the_mismatch_against_drawn_spectra(unknown: int) -> None:
         return np.stack([later * made[0] - made[1], later * made[2], made[3]])
 
     # What the other truck's equations make of the accelerations that this road gives the first.
-    mixing = np.moveaxis(_estimation(wrong, omega), 2, 0) @ np.linalg.inv(
-        np.moveaxis(_estimation(right, omega), 2, 0)
-    )
+    mixing = on_deck(wrong, omega) @ np.linalg.inv(on_deck(right, omega))
     seen = residuals(felt)
     change = residuals(np.einsum("fij,jsf->isf", mixing, felt)) - seen
     spectrum = noise_spectrum(right, QUIET, no_suspension_noise(), road, omega) / omega**4

@@ -22,8 +22,9 @@ from pre_core.physics.bridge import Beam, refine, uniform_beam
 from pre_core.physics.models import from_models
 from pre_core.physics.road import Profile, under_wheels
 from pre_core.physics.simulate import Discretisation, constant_speed, simulate
-from pre_core.physics.torsion import NO_TORSION, TorsionBasis, torsion_basis
+from pre_core.physics.torsion import NO_TORSION, TorsionBasis, mean_receptance, torsion_basis
 from pre_core.physics.vehicle import static_axle_loads_n, total_mass_kg
+from tests.numerics.bars import bar_receptance
 from tests.numerics.crossings import (
     STEP_S,
     bare_crossing,
@@ -197,3 +198,15 @@ def test_simulation_of_a_twisting_deck_needs_a_wave_speed() -> None:
     road = under_wheels(flat, motion, TRUCK.wheelbase_m, 1)
     with pytest.raises(ValueError, match="wave speed"):
         simulate(TRUCK, beam, motion, road, Discretisation(STEP_S))
+
+
+@pytest.mark.parametrize("supports", [(), (3,)])
+def test_mean_receptance_is_that_of_waves_in_a_bar(supports: tuple[int, ...]) -> None:
+    # Damped little, because the model's remainder beyond eight sines is not damped.
+    beam = TWISTING._replace(interior_supports=supports, rayleigh_beta_s=1e-4)
+    edges = np.concatenate([[0.0], np.cumsum(beam.element_lengths_m)])[[0, *supports, 7]]
+    damping = beam.rayleigh_alpha_per_s, beam.rayleigh_beta_s
+    omega = 2.0 * np.pi * np.array([0.01, 3.0, 9.0, 20.0, 40.0])
+    found = mean_receptance(torsion_of(beam), from_models(TRUCK, beam), omega)
+    expected = FLEXIBILITY_PER_N * bar_receptance(np.diff(edges), WAVE_M_PER_S, damping, omega)
+    assert np.abs(found - expected).max() < 0.01 * np.abs(expected).max()
