@@ -109,8 +109,9 @@ def _check_speed(run: Run) -> None:
 
 def notes_of(runs: Sequence[Run], site: Site) -> list[Guess]:
     """Return notes on what is strange in a drive and may be right."""
-    return [Guess(f"{Path(run.source).name}: {text}", "lost") for run in runs
-            for text in _strange(run, site)]  # fmt: skip
+    return [
+        Guess(Path(run.source).name, words, "lost") for run in runs for words in _strange(run, site)
+    ]
 
 
 def _strange(run: Run, site: Site) -> Iterator[str]:

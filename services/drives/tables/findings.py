@@ -33,9 +33,9 @@ class Findings:
             part.name: dict(part.found.columns) for part in parts
         }
 
-    def guess(self, part: TablePart, text: str, kind: GuessKind = "converts") -> None:
+    def guess(self, part: TablePart, words: str, kind: GuessKind = "converts") -> None:
         """Record a guess about a file."""
-        self._guesses.append(Guess(f"{part.name}: {text}", kind))
+        self._guesses.append(Guess(part.name, words, kind))
 
     def file(self, part: TablePart, **values: object) -> None:
         """Record values of a file's map."""

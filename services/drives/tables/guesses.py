@@ -3,34 +3,41 @@
 from collections.abc import Iterable
 from typing import Final, Literal, NamedTuple
 
-GuessKind = Literal["form", "lost", "open", "converts"]
-_BY_NAMES: Final = ("by their names ", "by the order of the columns ")
+GuessKind = Literal["form", "lost", "open", "converts", "columns"]
+TO_CONFIRM: Final = ("converts", "columns")
+"""Kinds that must be confirmed, in the order in which they are listed."""
 
 
 class Guess(NamedTuple):
     """An interpretation that the files do not state explicitly."""
 
-    text: str
+    file: str
+    words: str
     kind: GuessKind
     """Effect of the guess.
 
     It concerns the form of the text, data left out, a value that must be given before an import,
-    or changed numbers that must be confirmed.
+    changed numbers, or the quantities of columns; the last two must be confirmed.
     """
+
+    @property
+    def text(self) -> str:
+        """The guess with its file."""
+        return f"{self.file}: {self.words}"
 
 
 def grouped(guesses: Iterable[Guess]) -> list[Guess]:
     """Return the guesses with equal ones of several files in one, in the order of the first."""
-    files: dict[Guess, list[str]] = {}
-    for name, one in ((one.text.partition(": ")[0], one) for one in dict.fromkeys(guesses)):
-        files.setdefault(one._replace(text=one.text[len(name) :]), []).append(name)
-    return [one._replace(text=f"{_named(names)}{one.text}") for one, names in files.items()]
+    files: dict[tuple[str, GuessKind], list[str]] = {}
+    for one in dict.fromkeys(guesses):
+        files.setdefault((one.words, one.kind), []).append(one.file)
+    return [Guess(_named(names), words, kind) for (words, kind), names in files.items()]
 
 
 def conversions(guesses: Iterable[Guess]) -> list[str]:
-    """Return guesses to be confirmed, grouped: units and gravity before names of columns."""
-    texts = [one.text for one in grouped(guesses) if one.kind == "converts"]
-    return sorted(texts, key=lambda text: text.partition(": ")[2].startswith(_BY_NAMES))
+    """Return guesses to be confirmed, grouped: units and gravity before columns."""
+    found = [one for one in grouped(guesses) if one.kind in TO_CONFIRM]
+    return [one.text for one in sorted(found, key=lambda one: TO_CONFIRM.index(one.kind))]
 
 
 def _named(names: list[str]) -> str:

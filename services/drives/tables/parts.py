@@ -79,10 +79,10 @@ def read_part(
     name = sheet.path.name
     placed, unused = placed_columns(sheet, given, channels)
     if tuple(sheet.dialect) != _PLAIN and not _is_given(sheet.dialect, given):
-        guesses.append(Guess(f"{name}: {described(sheet.dialect)}", "form"))
+        guesses.append(Guess(name, described(sheet.dialect), "form"))
     if sheet.left_out:
-        text = f"{name}: {sheet.left_out} lines of comments, end text or a cut-off row left out"
-        guesses.append(Guess(text, "lost"))
+        words = f"{sheet.left_out} lines of comments, end text or a cut-off row left out"
+        guesses.append(Guess(name, words, "lost"))
     _check_headers(sheet, placed, given)
     unused = [head for head in unused if head]
     if unused:
@@ -92,7 +92,7 @@ def read_part(
                 f'{sheet.path}: no column is {absent[0]}, and "{unused[0][:40]}" is not known: '
                 "assign them in [file.columns] of a map (--map)"
             )
-        guesses.append(Guess(f"{name}: not used: {', '.join(unused)[:80]}", "form"))
+        guesses.append(Guess(name, f"not used: {', '.join(unused)[:80]}", "form"))
     for why, how in (("name", "their names"), ("order", "the order of the columns")):
         read = [
             f"{quantity} is {sheet.column_name(one.column)}"
@@ -100,7 +100,7 @@ def read_part(
             if one.why == why and quantity not in (TIME, DATE, WEEK)
         ]
         if read:
-            guesses.append(Guess(f"{name}: by {how} {', '.join(read)}", "converts"))
+            guesses.append(Guess(name, f"by {how} {', '.join(read)}", "columns"))
     quantities = [q for q in placed if q not in (TIME, DATE, WEEK)]
     holds_samples = any(q not in POSITION_COLUMNS for q in quantities)
     times = _times(sheet, given.time, placed, declared_hz if holds_samples else 0.0, zone, guesses)
@@ -233,7 +233,7 @@ def _times(
         if given.format is None and times.format not in ("unix_s", "start_s"):
             form = times.format.replace("_", " in ").replace("unix", "since 1970")
             form = form.replace("labview", "since 1904")
-            guesses.append(Guess(f"{name}: times are {form}", "converts"))
+            guesses.append(Guess(name, f"times are {form}", "converts"))
         return times
     times = _read(sheet, placed[TIME].column, texts, date_times, texts, given.order, zone)
     if times.order is None:

@@ -16,7 +16,13 @@ from services.drives.tables.reading import Understood
 
 _ROWS: Final = 3
 _BARS: Final = "▁▂▃▄▅▆▇█"
-_KINDS: Final = {"converts": "guess", "lost": "note", "open": "open", "form": "form"}
+_KINDS: Final = {
+    "converts": "guess",
+    "columns": "guess",
+    "lost": "note",
+    "open": "open",
+    "form": "form",
+}
 _GAP: Final = 1
 
 

@@ -1080,11 +1080,14 @@ def test_strange_drive_is_noted_and_read(
 def test_equal_guesses_of_several_files_are_one_and_units_come_first() -> None:
     units = "accelerations are in g"
     guesses = [
-        *(Guess(f"P_{k}.csv: by their names latitude_deg is column 2", "converts") for k in (1, 2)),
-        *(Guess(f"A_{k}.csv: {units}", "converts") for k in (1, 2, 3)),
-        Guess("P_1.csv: no altitude", "form"),
+        *(
+            Guess(f"P_{k}.csv", "by their names latitude_deg is column 2", "columns")
+            for k in (1, 2)
+        ),
+        *(Guess(f"A_{k}.csv", units, "converts") for k in (1, 2, 3)),
+        Guess("P_1.csv", "no altitude", "form"),
     ]
-    assert [one.text.partition(": ")[0] for one in grouped(guesses)] == [
+    assert [one.file for one in grouped(guesses)] == [
         "P_1.csv and 1 more",
         "A_1.csv and 2 more",
         "P_1.csv",
