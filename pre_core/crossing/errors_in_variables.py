@@ -26,7 +26,7 @@ from pre_core.crossing.noise import (
     force_masses,
 )
 from pre_core.crossing.rows import RESIDUALS, RowFilter
-from pre_core.parameters import M_U1
+from pre_core.parameters import M_U1, TORSION
 from pre_core.physics.torsion import NO_TORSION, TorsionBasis, mean_receptance
 
 _FREQUENCIES = 512
@@ -55,7 +55,8 @@ def mismatch_power(
     With r the residuals of the first truck and r_k those of another, each with its `channels`, E =
     M_k M_0^-1 - 1 describes how the latter mixes the input profiles, which differ by d; the front
     axle's residuals are taken when its wheel was at the rear's present place. `density` (4,) is
-    that of the sensors, `force` (2, shapes) the suspension noise in N²/Hz.
+    that of the sensors, `force` (2, shapes) the suspension noise in N²/Hz. Of the deck only the
+    torsional flexibility may differ.
     """
     at = folded(rows, _FREQUENCIES)
     road = stretch.mismatch
@@ -63,10 +64,15 @@ def mismatch_power(
     def crossed(omega: FloatArray, power: FloatArray) -> NDArray[np.complex128]:
         """(w, 3, f): E[(r_k - r)_l conj(r_0)], of which r_0, the mismatch, is d itself."""
         s = 1j * omega
+        deck = stretch.torsion
+        receptance = mean_receptance(deck, trucks[0].theta, omega)
 
         def estimation(k: int) -> NDArray[np.complex128]:
             channel = (1.0 + channels.gain[k])[:, None] * np.exp(np.outer(channels.delay_s[k], s))
-            equations = _with_torsion(trucks[k], omega, stretch.torsion)
+            equations = estimation_matrix(trucks[k], omega)
+            if receptance.any():
+                flexibility = trucks[k].theta[TORSION] * deck.load_factor
+                equations[:2] -= omega**2 * (flexibility * receptance) * _axle_masses(trucks[k])
             return np.moveaxis(equations * channel, 2, 0)
 
         inverse = np.linalg.inv(estimation(0))
@@ -86,16 +92,11 @@ def mismatch_power(
     return np.einsum("fl,wlf->w", weight, both).real / _FREQUENCIES
 
 
-def _with_torsion(
-    truck: NoisePath, omega: FloatArray, torsion: TorsionBasis
-) -> NDArray[np.complex128]:
-    """Return `estimation_matrix` (4, 4, f) with each axle's own deflection of a twisting deck.
+def _axle_masses(truck: NoisePath) -> FloatArray:
+    """Return the masses (2, 4, 1) in kg that multiply the readings in the axles' tyre forces.
 
-    The input profile is that of the road less the deflection, by the dynamic force of the tyre.
+    The receptance of a twisting deck times these forces is part of the input profiles, which are
+    the road's less each axle's own deflection.
     """
-    equations = estimation_matrix(truck, omega)
-    if not torsion.cubics.size:
-        return equations
-    masses = np.hstack([force_masses(truck), np.diag(truck.theta[M_U1 : M_U1 + 2])])
-    equations[:2] -= omega**2 * mean_receptance(torsion, truck.theta, omega) * masses[:, :, None]
-    return equations
+    unsprung = np.diag(truck.theta[M_U1 : M_U1 + 2])
+    return np.asarray(np.hstack([force_masses(truck), unsprung])[:, :, None])

@@ -275,16 +275,21 @@ def _noise_gradient(
 
     `trucks` and `density` (1 + n, 4) are those of `_displaced_points`.
     """
-    where, road = layout(problem), problem.mismatch
-    truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
-    changing = [*range(truck), *range(where.wheelbase, where.gains.stop)]
+    road, changing = problem.mismatch, _truck_and_gains(problem)
     force = REDUCED_WEIGHT_FACTOR * problem.force
-    slope = np.zeros(where.gains.stop)
+    slope = np.zeros(layout(problem).gains.stop)
     for part in parts_of(road, row_count(problem.rows, problem.crossing.rows)):
         profile_noise = part.mismatch if road.level_m3.any() else None
         power = noise_power(problem.rows, trucks, density, force, changing, profile_noise)
         slope[changing] += 0.5 * part.residuals * power / _SLOPE_STEP
     return slope
+
+
+def _truck_and_gains(problem: PosteriorProblem) -> list[int]:
+    """Return the places in y of the truck, its wheelbase and the gains, which change the noise."""
+    where = layout(problem)
+    truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
+    return [*range(truck), *range(where.wheelbase, where.gains.stop)]
 
 
 def replace_mismatch(
@@ -392,12 +397,7 @@ def mismatch_gradient(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
     is_inertial = bool(problem.force.any())
     at, trucks = _displaced_points(problem, y, where.delays.stop, is_inertial=is_inertial)
     estimated = problem.priors.estimated
-    truck = int(estimated[:FIRST_OF_BRIDGE].sum())
-    changing = [
-        *range(truck),
-        *range(where.wheelbase, where.gains.stop),
-        *range(where.delays.start, where.delays.stop),
-    ]
+    changing = [*_truck_and_gains(problem), *range(where.delays.start, where.delays.stop)]
     if estimated[TORSION]:
         changing.append(int(estimated[:TORSION].sum()))
     some = [0, *(1 + k for k in changing)]

@@ -94,10 +94,10 @@ def sine_cubics(part_m: FloatArray, span_m: FloatArray, modes: int) -> FloatArra
 
 
 def mean_receptance(basis: TorsionBasis, theta: FloatArray, omega: FloatArray) -> ComplexArray:
-    """Return the mean receptance (f,) in m/N of a deck under an axle, over its places.
+    """Return the mean receptance (f,) in m of a deck of g = 1/N under an axle, over its places.
 
     It is the deflection by a harmonic force on the same place, at angular frequencies (f,), of the
-    modes and the remainder below for `theta` (p,).
+    modes and the remainder below with the damping of `theta` (p,); zero for `NO_TORSION`.
     """
     squared = (1j * omega) ** 2
     lengths = np.diff(basis.ends_m, axis=1)[:, 0]
@@ -108,7 +108,7 @@ def mean_receptance(basis: TorsionBasis, theta: FloatArray, omega: FloatArray) -
         damping = 1j * omega * (theta[ALPHA] + theta[BETA] * eigenvalue)
         dynamic = basis.wave_speed_m_per_s**2 / (eigenvalue + damping + squared) - wave**-2.0
         total += length / lengths.sum() * (length / 6.0 + dynamic.sum(axis=0) / length)
-    return theta[TORSION] * basis.load_factor * total
+    return total
 
 
 @inner
