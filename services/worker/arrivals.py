@@ -147,12 +147,15 @@ class ArrivalQueue:
             self._leaves[truck] = _Leave(message.received_s, _SILENT_S)
             self._lost.pop(truck, None)
         name = (*truck, message.boot_id)
-        highest = self._highest[name]
-        if name not in self._known:
-            self._new.setdefault(name, _History(message.received_s, highest)).add(message)
+        highest, is_known = self._highest[name], name in self._known
+        if not is_known and name not in self._new:
+            self._new[name] = _History(message.received_s, highest)
         stream = message.key.stream
         highest[stream] = max(highest.get(stream, 0), message.sequence)
-        return [message] if name in self._known else []
+        if is_known:
+            return [message]
+        self._new[name].add(message)
+        return []
 
     def _note_return(self, truck: _Vehicle) -> None:
         """Collect a history of a truck that left and is back, as of a new one."""
