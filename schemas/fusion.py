@@ -59,6 +59,9 @@ class Bends(StrictModel):
     directions: tuple[Finite, ...] = ()
     """Matrix (b + 1, b + 1), row by row, whose columns are the moves of unit size; empty where they
     are those of single coordinates."""
+    logarithms: Annotated[int, Field(ge=0)] = 0
+    """Number of the last parameters of the bridge, all elements, whose x enters as ln x, in moves
+    and in R; zero in results of earlier versions."""
 
 
 class ShortWaves(StrictModel):
@@ -119,6 +122,10 @@ class FusionLikelihood(StrictModel):
         moves = len(self.bridge) + 1
         if len(self.bends.about) != moves - 1:
             raise ValueError("bends must be of the bridge's coordinates and the place")
+        if self.bends.logarithms > moves - 1 or any(
+            x <= 0.0 for x in self.bends.about[moves - 1 - self.bends.logarithms :]
+        ):
+            raise ValueError("logarithms must be of parameters of the bridge with a positive x")
         given = (len(self.bends.size), len(self.bends.directions))
         if given not in ((moves, 0), (0, moves**2)):
             raise ValueError(f"bends must have {moves} sizes or {moves**2} numbers of directions")

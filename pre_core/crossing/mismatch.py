@@ -231,6 +231,12 @@ def tilt_of(cycles_per_m: FloatArray) -> FloatArray:
     return np.asarray(np.log(np.clip(cycles_per_m, low, high) / _PIVOT_CYCLES_PER_M))
 
 
+def has_alike_tyres(mismatch: Mismatch) -> bool:
+    """Return whether the compared axles both have single tyres, or both twin ones."""
+    front, rear = mismatch.shapes.footprints
+    return (front.twin_distance_m > 0.0) == (rear.twin_distance_m > 0.0)
+
+
 def long_wave_power(mismatch: Mismatch) -> float:
     """Return the expected power on the bridge over that off it, at `LONG_CYCLES_PER_M`."""
     if mismatch.pavement is None:

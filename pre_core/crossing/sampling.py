@@ -4,7 +4,6 @@ Draws of a cheap density near the posterior (`surrogate`) are weighted by the po
 that density for the next draws. All batches are weighted as draws of one mixture density.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -14,31 +13,25 @@ from scipy.special import log_ndtr
 from pre_core.arrays import FloatArray
 from pre_core.crossing import compliances, posterior, surrogate
 from pre_core.crossing.fit import Optimum, normal_approximation
+from pre_core.crossing.mismatch import has_alike_tyres
+from pre_core.crossing.surface_posterior import complete, draw_curved, surface_posterior
+from pre_core.crossing.weighted_draws import (
+    MIN_EFFECTIVE_SHARE,
+    WeightedDraws,
+    importance_draws,
+    is_enough,
+)
 from pre_core.parameters import RHO_A, TORSION
 from pre_core.physics.torsion import NO_TORSION
 from pre_core.search import convergence, importance, levenberg_marquardt
 from pre_core.search.loop import Report, Termination
 
-LogDensity = Callable[[FloatArray], FloatArray]
-"""Logarithm of the posterior (k,) at points (k, f), up to a constant."""
-
 _LARGEST_R_HAT = 1.05
 """Convergence limit of R-hat of rigidities and mass."""
-_MIN_EFFECTIVE_SHARE = 1.0 / 3.0
-"""Required effective size of the draws, relative to the requested ones."""
-_BATCH_SHARE = 1.0 / 3.0
-"""Size of a batch of weighted draws, relative to the requested ones."""
-_UNWEIGHTED_BATCHES = 2
-"""Number of first batches whose refinement ignores the weights: their draws are too far from the
-posterior for informative weights."""
-_MAX_BATCHES = 25
 _MAX_RUNS = 14
-"""Limit of draws with mismatch, relative to the requested ones."""
-_LARGEST_PARETO_K = 0.7
+"""Limit of draws with alike tyres, relative to the requested ones."""
 _NEGLIGIBLE_ODDS = 0.02
 """Odds below which torsion is omitted from the draws: it changes no interval and costs draws."""
-_MAX_POINTS = 100
-"""Number of points evaluated together: their residuals take some megabytes."""
 
 
 class PosteriorDraws(NamedTuple):
@@ -55,6 +48,8 @@ class PosteriorDraws(NamedTuple):
     evaluations: int
     ending: Termination
     pareto_k: float | None = None
+    points: FloatArray | None = None
+    """Points (`response_surface.POINTS`, n + 1) of the widened posterior with mismatch."""
 
 
 def sample(
@@ -71,7 +66,7 @@ def sample(
     Improbable torsion is zero in all draws.
     """
     if found.problem.mismatch.level_m3.any():
-        return _mismatch_draws(found, draws, seed, inflation)
+        return _mismatch_draws(found, draws, seed, inflation, report)
     place = _improbable_torsion(found, inflation)
     if place is None:
         return _single_profile_draws(found, draws, seed, inflation, report)
@@ -124,71 +119,12 @@ def _single_profile_draws(
 
     coordinates = surrogate.coordinates(found, inflation)
     first = surrogate.gauss_newton_surrogate(found, coordinates)
-    weighted = _importance_draws(target, coordinates, first, found.state.y, draws, seed, report)
+    weighted = importance_draws(target, coordinates, first, found.state.y, draws, seed, report)
     return _resample_to_chains(weighted, _monitored_indices(problem), draws, seed)
 
 
-class _WeightedDraws(NamedTuple):
-    """Points y (k, f) and their smoothed weights."""
-
-    y: FloatArray
-    worth: importance.SmoothedWeights
-
-
-def _importance_draws(
-    target: LogDensity,
-    coordinates: surrogate.SurrogateCoordinates,
-    now: surrogate.Surrogate,
-    start: FloatArray,
-    draws: int,
-    seed: int,
-    report: Report,
-) -> _WeightedDraws:
-    """Return weighted draws in batches until they suffice, or all of `_MAX_BATCHES`.
-
-    Each batch is of a surrogate, `now` at first, that is refined by the draws so far; its chains
-    start about `start` (f,). All draws are weighted as of the mixture of the surrogates.
-    """
-    centre = surrogate.transform(coordinates, start)
-    count = convergence.CHAINS * -(-round(_BATCH_SHARE * draws) // convergence.CHAINS)
-    used: list[surrogate.Surrogate] = []
-    y, x = np.empty((0, centre.size)), np.empty((0, centre.size))
-    log_target = np.empty(0)
-    while True:
-        report("weighting draws of the posterior", 0.5 + 0.02 * len(used))
-        new = surrogate.draw(now, coordinates, centre, count, seed, len(used))
-        used.append(now)
-        log_posterior = _in_parts(target, new)
-        y, x = np.concatenate([y, new]), np.concatenate([x, surrogate.transform(coordinates, new)])
-        log_target = np.concatenate(
-            [log_target, log_posterior - surrogate.log_prior(coordinates, new)]
-        )
-        log_density = np.stack([surrogate.log_likelihood(one, x) for one in used], axis=1)
-        counts = np.full(len(used), count)
-        worth = importance.pareto_smooth(
-            importance.mixture_log_weights(log_target, log_density, counts)
-        )
-        if _is_enough(worth, draws) or len(used) == _MAX_BATCHES:
-            return _WeightedDraws(y, worth)
-        now = surrogate.refine(
-            now, coordinates, x, log_target, count, is_weighted=len(used) > _UNWEIGHTED_BATCHES
-        )
-
-
-def _in_parts(target: LogDensity, y: FloatArray) -> FloatArray:
-    """Return the target (k,) at y (k, f), minus infinity where it is not finite."""
-    found = np.concatenate(
-        [target(y[i : i + _MAX_POINTS]) for i in range(0, y.shape[0], _MAX_POINTS)]
-    )
-    return np.where(np.isfinite(found), found, -np.inf)
-
-
-def _is_enough(worth: importance.SmoothedWeights, draws: int) -> bool:
-    return worth.pareto_k <= _LARGEST_PARETO_K and worth.ess >= _MIN_EFFECTIVE_SHARE * draws
-
-
 def _resample_to_chains(
-    weighted: _WeightedDraws, monitored: NDArray[np.int64], draws: int, seed: int
+    weighted: WeightedDraws, monitored: NDArray[np.int64], draws: int, seed: int
 ) -> PosteriorDraws:
     """Return weighted draws resampled by their weights, in the form of chains."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 22,)))
@@ -202,18 +138,40 @@ def _resample_to_chains(
         worth.ess,
         worth.ess / y.shape[0],
         y.shape[0],
-        Termination.STEPS_DONE if _is_enough(worth, draws) else Termination.STEPS_EXHAUSTED,
+        Termination.STEPS_DONE if is_enough(worth, draws) else Termination.STEPS_EXHAUSTED,
         worth.pareto_k,
     )
 
 
-def _mismatch_draws(found: Optimum, draws: int, seed: int, inflation: float) -> PosteriorDraws:
-    """Return draws with mismatch and poorly determined elements: those of `compliances`.
+def _mismatch_draws(
+    found: Optimum, draws: int, seed: int, inflation: float, report: Report
+) -> PosteriorDraws:
+    """Return draws with mismatch: of a response surface, or of `compliances`.
 
-    The residuals are not evaluated again. The truck is determined by its own sensors, through
-    residuals so exact that their curvature keeps chains from moving; its effect on EI is far below
-    the uncertainty by the mismatch.
+    The second are those of alike tyres, and where weighted draws of the surface do not suffice. The
+    residuals are not evaluated again for them: the truck is determined by its own sensors, through
+    residuals so exact that their curvature keeps chains from moving.
     """
+    points, evaluations = None, 0
+    if not has_alike_tyres(found.problem.mismatch):
+        of = surface_posterior(found, inflation, seed)
+        points, evaluations = of.points, of.evaluations
+        weighted = draw_curved(found, of, draws, seed, inflation, report)
+        if is_enough(weighted.worth, draws):
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 24,)))
+            drawn = complete(found, of, weighted.y, inflation, rng)
+            drawn += compliances.MISMATCH_BIAS_SPREAD * np.outer(
+                rng.standard_normal(drawn.shape[0]), compliances.mismatch_bias(found)
+            )
+            of_all = WeightedDraws(drawn, weighted.worth)
+            chains = _resample_to_chains(of_all, _monitored_indices(found.problem), draws, seed)
+            return chains._replace(evaluations=evaluations, points=points)
+    chains = _compliance_draws(found, draws, seed, inflation)
+    return chains._replace(evaluations=evaluations, points=points)
+
+
+def _compliance_draws(found: Optimum, draws: int, seed: int, inflation: float) -> PosteriorDraws:
+    """Return draws of the normal about the optimum, linear in c, with the exact priors."""
     near = compliances.compliance_posterior(found, inflation)
     monitored = _monitored_indices(found.problem)
     kept: list[FloatArray] = []
@@ -226,7 +184,7 @@ def _mismatch_draws(found: Optimum, draws: int, seed: int, inflation: float) -> 
             np.stack([compliances.draws(near, wanted, seed, one) for one in streams], axis=1)
         )
         r_hat, ess, ending = _convergence(
-            np.concatenate(kept)[:, :, monitored], _MIN_EFFECTIVE_SHARE * draws
+            np.concatenate(kept)[:, :, monitored], MIN_EFFECTIVE_SHARE * draws
         )
         if ending is Termination.STEPS_DONE:
             break

@@ -85,6 +85,27 @@ def coordinates(found: Optimum, inflation: float) -> SurrogateCoordinates:
     )
 
 
+def restricted(coords: SurrogateCoordinates, kept: NDArray[np.int64]) -> SurrogateCoordinates:
+    """Return the coordinates of a density of the coordinates `kept` (n,) alone, none of it normal.
+
+    All curved and half-normal coordinates that matter are among them.
+    """
+    place = {int(index): n for n, index in enumerate(kept)}
+    curved = [n for n, index in enumerate(coords.curved) if int(index) in place]
+
+    def among(indices: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.array([place[int(i)] for i in indices if int(i) in place], dtype=np.int64)
+
+    return SurrogateCoordinates(
+        among(coords.curved),
+        coords.sigma[curved],
+        among(coords.half_normal),
+        coords.log_odds[kept],
+        np.arange(kept.size),
+        coords.inflation,
+    )
+
+
 def transform(coords: SurrogateCoordinates, y: FloatArray) -> FloatArray:
     """Return the coordinates x (k, f) of points y (k, f), or of one point (f,)."""
     x = y.copy()
@@ -184,10 +205,13 @@ def _directions(coords: SurrogateCoordinates, z: FloatArray) -> FloatArray:
     """Return directions (f, d) along which curvature is regressed, from scaled draws z (k, f)."""
     f = z.shape[1]
     others = np.setdiff1d(np.arange(f), coords.non_normal)
+    of_non_normal = np.eye(f)[:, coords.non_normal]
+    if others.size == 0:
+        return of_non_normal
     variance, vectors = np.linalg.eigh(np.cov(z[:, others].T))
     main = np.zeros((f, _NUISANCES))
     main[others] = vectors[:, -_NUISANCES:] / np.sqrt(variance[-_NUISANCES:])
-    return np.column_stack([np.eye(f)[:, coords.non_normal], main])
+    return np.column_stack([of_non_normal, main])
 
 
 def _regress(

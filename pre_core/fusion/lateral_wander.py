@@ -14,7 +14,7 @@ import numpy as np
 
 from pre_core.arrays import FloatArray
 from pre_core.crossing.mismatch import Mismatch, between_run_spectra
-from pre_core.fusion.likelihood import OFF_BRIDGE_STEP_M, OffBridgeMismatch
+from pre_core.fusion.long_waves import OFF_BRIDGE_STEP_M, OffBridgeMismatch
 from pre_core.physics.road import Profile
 from pre_core.physics.surface import Footprint
 

@@ -20,6 +20,8 @@ from pre_core.fusion.lateral_wander import (
 )
 from pre_core.fusion.likelihood import (
     CrossingLikelihood,
+)
+from pre_core.fusion.long_waves import (
     covariance_of_coefficients,
     long_share,
 )

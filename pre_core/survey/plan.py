@@ -26,8 +26,10 @@ from pre_core.crossing.mismatch import Mismatch, between_run_spectra
 from pre_core.fusion.likelihood import (
     CrossingLikelihood,
     add_covariance,
-    covariance_of_coefficients,
     likelihood,
+)
+from pre_core.fusion.long_waves import (
+    covariance_of_coefficients,
 )
 from pre_core.fusion.path_groups import low_rank_root
 from pre_core.search import levenberg_marquardt

@@ -308,16 +308,18 @@ class Stretch(_message.Message):
     def __init__(self, begin_m: _Optional[float] = ..., step_m: _Optional[float] = ..., values: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Bends(_message.Message):
-    __slots__ = ("about", "size", "shapes", "directions")
+    __slots__ = ("about", "size", "shapes", "directions", "logarithms")
     ABOUT_FIELD_NUMBER: _ClassVar[int]
     SIZE_FIELD_NUMBER: _ClassVar[int]
     SHAPES_FIELD_NUMBER: _ClassVar[int]
     DIRECTIONS_FIELD_NUMBER: _ClassVar[int]
+    LOGARITHMS_FIELD_NUMBER: _ClassVar[int]
     about: _containers.RepeatedScalarFieldContainer[float]
     size: _containers.RepeatedScalarFieldContainer[float]
     shapes: _containers.RepeatedScalarFieldContainer[float]
     directions: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, about: _Optional[_Iterable[float]] = ..., size: _Optional[_Iterable[float]] = ..., shapes: _Optional[_Iterable[float]] = ..., directions: _Optional[_Iterable[float]] = ...) -> None: ...
+    logarithms: int
+    def __init__(self, about: _Optional[_Iterable[float]] = ..., size: _Optional[_Iterable[float]] = ..., shapes: _Optional[_Iterable[float]] = ..., directions: _Optional[_Iterable[float]] = ..., logarithms: _Optional[int] = ...) -> None: ...
 
 class ShortWaves(_message.Message):
     __slots__ = ("step_cycles_per_m", "cosine", "sine")

@@ -9,6 +9,7 @@ from pre_core import parameters
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.posterior import log_odds
 from pre_core.fusion import likelihood as of_crossing
+from pre_core.fusion import long_waves
 from pre_core.fusion.crossing_consistency import select_consistent
 from pre_core.fusion.curvature import CurvatureTerms
 from pre_core.fusion.information import BridgePriors
@@ -50,9 +51,11 @@ class FusedBridge(NamedTuple):
     disagree: bool
 
 
-def stored(data: CrossingData, found: Optimum) -> fusion.FusionLikelihood:
-    """Return the likelihood of a crossing as a part of its result."""
-    likelihood = of_crossing.likelihood(found)
+def stored(
+    data: CrossingData, found: Optimum, points: Floats | None = None
+) -> fusion.FusionLikelihood:
+    """Return the likelihood of a crossing as a part of its result; `points` are as there."""
+    likelihood = of_crossing.likelihood(found, points=points)
     priors = found.problem.priors
     absence = dict(
         zip(parameters.names(data.bridge.elements), priors.absence.tolist(), strict=True)
@@ -70,7 +73,7 @@ def stored(data: CrossingData, found: Optimum) -> fusion.FusionLikelihood:
         mass_spread=data.vehicle.spread("total_mass_kg"),
         footprints=(front, rear),
         first_knot_m=float(likelihood.knots_m[0]) if likelihood.knots_m.size else None,
-        knot_spacing_m=of_crossing.knot_spacing_m(found.problem.mismatch),
+        knot_spacing_m=long_waves.knot_spacing_m(found.problem.mismatch),
         level_m3=_rounded(likelihood.level_m3),
         off_bridge_m=_stretches(likelihood.off_bridge),
         bends=_stored_bends(likelihood.bends),
@@ -83,7 +86,12 @@ def _stored_bends(of: CurvatureTerms | None) -> fusion.Bends | None:
         return None
     shapes = _rounded(of.shapes.ravel(), _FEW_DIGITS)
     directions = _rounded(of.directions.ravel())
-    return fusion.Bends(about=_rounded(of.about), directions=directions, shapes=shapes)
+    return fusion.Bends(
+        about=_rounded(of.about),
+        directions=directions,
+        shapes=shapes,
+        logarithms=of.logarithms,
+    )
 
 
 def _stored_short_waves(of: ShortWaveResponse | None) -> fusion.ShortWaves | None:
@@ -115,11 +123,11 @@ def _coordinates(
     )
 
 
-def _stretches(off: of_crossing.OffBridgeMismatch | None) -> tuple[fusion.Stretch, ...]:
+def _stretches(off: long_waves.OffBridgeMismatch | None) -> tuple[fusion.Stretch, ...]:
     """Return the values present, as segments without gaps."""
     if off is None:
         return ()
-    step = of_crossing.OFF_BRIDGE_STEP_M
+    step = long_waves.OFF_BRIDGE_STEP_M
     there = np.flatnonzero(np.isfinite(off.value_m))
     pieces = np.split(there, np.flatnonzero(np.diff(there) > 1) + 1) if there.size else []
     return tuple(
@@ -284,7 +292,7 @@ def _bends(of: fusion.FusionLikelihood) -> CurvatureTerms | None:
     directions = np.array(of.bends.directions).reshape(-1, moves)
     if of.bends.size:
         directions = np.diag(of.bends.size)
-    return CurvatureTerms(np.array(of.bends.about), directions, shapes)
+    return CurvatureTerms(np.array(of.bends.about), directions, shapes, of.bends.logarithms)
 
 
 def _short_waves(of: fusion.FusionLikelihood) -> ShortWaveResponse | None:
@@ -297,14 +305,14 @@ def _short_waves(of: fusion.FusionLikelihood) -> ShortWaveResponse | None:
     return ShortWaveResponse(of.short_waves.step_cycles_per_m, cosine, sine)
 
 
-def _off_bridge(of: fusion.FusionLikelihood) -> of_crossing.OffBridgeMismatch | None:
+def _off_bridge(of: fusion.FusionLikelihood) -> long_waves.OffBridgeMismatch | None:
     if not of.off_bridge_m:
         return None
-    step = of_crossing.OFF_BRIDGE_STEP_M
+    step = long_waves.OFF_BRIDGE_STEP_M
     begin = min(one.begin_m for one in of.off_bridge_m)
     end = max(one.begin_m + step * len(one.values) for one in of.off_bridge_m)
     values = np.full(round((end - begin) / step), np.nan)
     for one in of.off_bridge_m:
         first = round((one.begin_m - begin) / step)
         values[first : first + len(one.values)] = one.values
-    return of_crossing.OffBridgeMismatch(begin, values)
+    return long_waves.OffBridgeMismatch(begin, values)

@@ -246,7 +246,7 @@ def identify_pre(
         reason_texts=tuple(texts(once, {**about, Reason.IMPLAUSIBLE_BRIDGE: implausible})),
         chi2_per_dof=found.chi2_per_dof * found.noise_power,
         diagnostics=diagnostics,
-        fusion_likelihood=stored(data, found),
+        fusion_likelihood=stored(data, found, chain.points),
         **values,
     )
 

@@ -1,4 +1,4 @@
-"""A crossing on a road surface under equal tyres, at its truth."""
+"""A crossing on a road surface, at its truth: under equal tyres, or twin ones behind."""
 
 from functools import cache
 
@@ -16,9 +16,9 @@ from studies.validation.surveys import crossing_truth, site_of_truck
 
 
 @cache
-def at_its_truth() -> Optimum:
+def at_its_truth(of: str = "single-5") -> Optimum:
     """Return the truth of a crossing of five elements as if a search had ended there."""
-    kind = KINDS["single-5"]._replace(elements=5)
+    kind = KINDS[of]._replace(elements=5)
     site = site_of_truck(default_site(), kind, 0)
     truth, seed = crossing_truth(site, kind, 0, 0, 0)
     one = drive(site, truth, seed)

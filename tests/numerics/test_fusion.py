@@ -23,15 +23,17 @@ from pre_core.fusion.lateral_wander import (
     wander_posterior,
 )
 from pre_core.fusion.likelihood import (
+    Coordinates,
+    CrossingLikelihood,
+    likelihood,
+)
+from pre_core.fusion.long_waves import (
     ALIKE_KNOT_M,
     KNOT_M,
     OFF_BRIDGE_STEP_M,
-    Coordinates,
-    CrossingLikelihood,
     OffBridgeMismatch,
     covariance_of_coefficients,
     knot_spacing_m,
-    likelihood,
     long_share,
 )
 from pre_core.fusion.path_groups import FusionInput

@@ -80,7 +80,7 @@ def test_moves_of_single_coordinates_are_directions_too() -> None:
             update={
                 "root": tuple(np.eye(m)[np.triu_indices(m)]),
                 "target": (0.0,) * m,
-                "bends": fusion.Bends(**terms, **given),
+                "bends": fusion.Bends.model_validate({**terms, **given}),
             }
         )
         part, _ = part_of(Source("one", "lorry", 1, curved))

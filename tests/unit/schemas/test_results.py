@@ -155,10 +155,13 @@ def likelihoods(draw: st.DrawFn) -> FusionLikelihood:
             Stretch(begin_m=draw(numbers), step_m=draw(sizes), values=some(draw(st.integers(0, 3))))
             for _ in range(draw(st.integers(0, 2)))
         ),
-        bends=Bends(
-            about=some(len(bridge)),
-            shapes=some(count * moves * (moves + 1) // 2),
-            **draw(st.sampled_from([{"size": (0.5,) * moves}, {"directions": some(moves**2)}])),
+        bends=Bends.model_validate(
+            {
+                "about": tuple(1.0 + abs(x) for x in some(len(bridge))),
+                "shapes": some(count * moves * (moves + 1) // 2),
+                "logarithms": draw(st.integers(0, len(bridge))),
+                **draw(st.sampled_from([{"size": (0.5,) * moves}, {"directions": some(moves**2)}])),
+            }
         )
         if knots
         else None,

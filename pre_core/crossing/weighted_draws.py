@@ -1,0 +1,86 @@
+"""Weighted draws of a density, from surrogates that are refined as draws are weighted."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from pre_core.arrays import FloatArray
+from pre_core.crossing import surrogate
+from pre_core.search import convergence, importance
+from pre_core.search.loop import Report
+
+LogDensity = Callable[[FloatArray], FloatArray]
+"""Logarithm of a density (k,) at points (k, f), up to a constant."""
+
+MIN_EFFECTIVE_SHARE = 1.0 / 3.0
+"""Required effective size of the draws, relative to the requested ones."""
+_BATCH_SHARE = 1.0 / 3.0
+"""Size of a batch of weighted draws, relative to the requested ones."""
+_UNWEIGHTED_BATCHES = 2
+"""Number of first batches whose refinement ignores the weights: their draws are too far from the
+posterior for informative weights."""
+_MAX_BATCHES = 25
+_LARGEST_PARETO_K = 0.7
+_MAX_POINTS = 100
+"""Number of points evaluated together: their residuals take some megabytes."""
+
+
+class WeightedDraws(NamedTuple):
+    """Points y (k, f) and their smoothed weights."""
+
+    y: FloatArray
+    worth: importance.SmoothedWeights
+
+
+def importance_draws(
+    target: LogDensity,
+    coordinates: surrogate.SurrogateCoordinates,
+    now: surrogate.Surrogate,
+    start: FloatArray,
+    draws: int,
+    seed: int,
+    report: Report,
+) -> WeightedDraws:
+    """Return weighted draws in batches until they suffice, or all of `_MAX_BATCHES`.
+
+    Each batch is of a surrogate, `now` at first, that is refined by the draws so far; its chains
+    start about `start` (f,). All draws are weighted as of the mixture of the surrogates.
+    """
+    centre = surrogate.transform(coordinates, start)
+    count = convergence.CHAINS * -(-round(_BATCH_SHARE * draws) // convergence.CHAINS)
+    used: list[surrogate.Surrogate] = []
+    y, x = np.empty((0, centre.size)), np.empty((0, centre.size))
+    log_target = np.empty(0)
+    while True:
+        report("weighting draws of the posterior", 0.5 + 0.02 * len(used))
+        new = surrogate.draw(now, coordinates, centre, count, seed, len(used))
+        used.append(now)
+        log_posterior = _in_parts(target, new)
+        y, x = np.concatenate([y, new]), np.concatenate([x, surrogate.transform(coordinates, new)])
+        log_target = np.concatenate(
+            [log_target, log_posterior - surrogate.log_prior(coordinates, new)]
+        )
+        log_density = np.stack([surrogate.log_likelihood(one, x) for one in used], axis=1)
+        counts = np.full(len(used), count)
+        worth = importance.pareto_smooth(
+            importance.mixture_log_weights(log_target, log_density, counts)
+        )
+        if is_enough(worth, draws) or len(used) == _MAX_BATCHES:
+            return WeightedDraws(y, worth)
+        now = surrogate.refine(
+            now, coordinates, x, log_target, count, is_weighted=len(used) > _UNWEIGHTED_BATCHES
+        )
+
+
+def _in_parts(target: LogDensity, y: FloatArray) -> FloatArray:
+    """Return the target (k,) at y (k, f), minus infinity where it is not finite."""
+    found = np.concatenate(
+        [target(y[i : i + _MAX_POINTS]) for i in range(0, y.shape[0], _MAX_POINTS)]
+    )
+    return np.where(np.isfinite(found), found, -np.inf)
+
+
+def is_enough(worth: importance.SmoothedWeights, draws: int) -> bool:
+    """Return whether weighted draws stand for the requested ones, with a light tail."""
+    return worth.pareto_k <= _LARGEST_PARETO_K and worth.ess >= MIN_EFFECTIVE_SHARE * draws

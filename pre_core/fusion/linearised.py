@@ -1,0 +1,71 @@
+"""A crossing's residuals as a function of what fusion shares, linear or of second order."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.arrays import FloatArray
+from pre_core.crossing import posterior
+from pre_core.crossing.compliances import to_compliance_coordinates
+from pre_core.crossing.response_surface import ResponseSurface
+from pre_core.fusion.curvature import CurvatureTerms
+from pre_core.search import levenberg_marquardt
+
+_LEAST_TERM = 0.05
+"""Smallest curvature term that is kept, if all moves are of unit size, in standard deviations."""
+_MAX_TERMS = 60
+
+
+class Linearised(NamedTuple):
+    """Residuals (m,) + jacobian (m, n) (x - centre), of bridge, truck, waves, then all others."""
+
+    jacobian: FloatArray
+    residual: FloatArray
+    centre: FloatArray
+
+
+def of_surface(surface: ResponseSurface, sigma: FloatArray) -> tuple[CurvatureTerms, Linearised]:
+    """Return the terms of a surface, and it with the offset and the terms after the waves.
+
+    `sigma` (elements,) are the spreads of ln EI, for c = exp(-sigma y).
+    """
+    n = sigma.size
+    weight, shapes = np.linalg.eigh(surface.products.T @ surface.products)
+    shapes = shapes[:, np.flatnonzero(weight > _LEAST_TERM**2)[::-1][:_MAX_TERMS]]
+    per_y = np.ones(surface.centre.size)
+    per_y[-1 - n : -1] = -sigma
+    centre = per_y * surface.centre
+    centre[-1] = 0.0  # the offset counts from there
+    size = per_y * surface.size
+    about = centre[:-1].copy()
+    about[-n:] = np.exp(about[-n:])
+    # Slopes by a bridge that the truck does not follow.
+    slopes = (surface.slopes - surface.linear @ surface.follow) / size
+    jacobian = np.hstack(
+        [slopes[:, :-1], surface.linear, surface.waves, slopes[:, -1:], surface.products @ shapes]
+    )
+    at = np.zeros(jacobian.shape[1])
+    at[: centre.size - 1 + surface.at.size] = np.concatenate([centre[:-1], surface.at])
+    terms = CurvatureTerms(about, np.diag(size), shapes.T, n)
+    return terms, Linearised(jacobian, surface.constant, at)
+
+
+def of_optimum(
+    problem: posterior.PosteriorProblem,
+    state: levenberg_marquardt.LMState,
+    rows: NDArray[np.int64],
+    kept: NDArray[np.int64],
+    waves: FloatArray,
+) -> Linearised:
+    """Return the normal about an optimum, of its residuals `rows` (m,) and mismatch `waves` (m, q).
+
+    The coordinates that are not `kept` (n,) come last.
+    """
+    centre, jacobian = to_compliance_coordinates(problem, state.y, state.jacobian[rows])
+    others = np.setdiff1d(np.arange(centre.size), kept)
+    return Linearised(
+        np.hstack([jacobian[:, kept], waves, jacobian[:, others]]),
+        state.residual[rows],
+        np.concatenate([centre[kept], np.zeros(waves.shape[1]), centre[others]]),
+    )

@@ -1,0 +1,131 @@
+"""Response surfaces of a crossing: true to its residuals where the posterior is."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pre_core.arrays import FloatArray
+from pre_core.crossing import compliances, posterior
+from pre_core.crossing.fit import Optimum
+from pre_core.crossing.response_surface import (
+    ResponseSurface,
+    _fit_parabolas,
+    place_of_offset,
+    residuals_of,
+)
+from pre_core.crossing.surface_posterior import SurfacePosterior, draw_curved, surface_posterior
+from pre_core.fusion.curvature import to_surface_coordinates
+from pre_core.fusion.linearised import of_surface
+from pre_core.search.levenberg_marquardt import minimise
+from tests.numerics.single_tyres import at_its_truth
+
+TWIN = "five-elements"
+DRAWS = 16
+
+
+def vibration(found: Optimum, bridges: FloatArray, curved: NDArray[np.int64]) -> FloatArray:
+    """Return a root (m, 2 k) of the mean covariance of the first mode's waves on bridges (k, n)."""
+    first = posterior.layout(found.problem).swing.start
+    y = np.repeat(found.state.y[None, :], bridges.shape[0], axis=0)
+    y[:, curved] = bridges
+    apart = []
+    for place in (first, first + 1):
+        up, down = y.copy(), y.copy()
+        up[:, place], down[:, place] = 0.5, -0.5
+        apart.append(
+            posterior.all_rows(found.problem, up) - posterior.all_rows(found.problem, down)
+        )
+    return np.asarray(np.concatenate(apart).T / np.sqrt(bridges.shape[0]))
+
+
+def least_squares(
+    found: Optimum, of: SurfacePosterior, curved: FloatArray, waves: FloatArray
+) -> float:
+    """Return the least sum of squares at curved coordinates and offset, over all others in y.
+
+    The residuals themselves are fitted again, without the priors of the curved coordinates; the
+    first mode of the vibration before the crossing is noise of the root `waves`.
+    """
+    where = posterior.layout(found.problem)
+    rows = compliances.without_priors(found.problem, found.state.residual.size, of.curved)
+    place, swing = place_of_offset(found.problem), where.swing.start + np.arange(2)
+    y = found.state.y.copy()
+    y[of.curved] = curved[:-1]
+    y[where.trajectory] += curved[-1] - y[place]
+    y[swing] = 0.0
+    free = np.setdiff1d(np.arange(y.size), np.concatenate([of.curved, [place], swing]))
+    along, size, _ = np.linalg.svd(waves[rows], full_matrices=False)
+
+    def moved(x: FloatArray) -> FloatArray:
+        points = np.repeat(y[None, :], x.shape[0], axis=0)
+        points[:, free] = x
+        out = posterior.all_rows(found.problem, points)[:, rows]
+        return np.asarray(out - (out @ along) * (1.0 - 1.0 / np.sqrt(1.0 + size**2)) @ along.T)
+
+    return minimise(moved, y[free], 40, 1e-3).state.objective
+
+
+@pytest.mark.slow
+def test_the_surface_has_the_least_squares_of_the_residuals() -> None:
+    """At draws of the posterior that it was not fitted to, all other coordinates fitted again."""
+    found = at_its_truth(TWIN)
+    of = surface_posterior(found, 1.0, seed=1)
+    weighted = draw_curved(found, of, 1000, 7, 1.0)
+    rng = np.random.default_rng(3)
+    drawn = weighted.y[rng.choice(weighted.y.shape[0], DRAWS, p=weighted.worth.weight)]
+    bridges = of.points[rng.choice(of.points.shape[0], 60, replace=False), :-1]
+    waves = vibration(found, bridges, of.curved)
+    true = np.array([least_squares(found, of, one, waves) for one in drawn])
+    seen = np.sum(residuals_of(of.surface, drawn) ** 2, axis=1)
+    # In -2 ln p, which varies by four over these draws.
+    assert np.std(seen - true) < 0.5 * np.std(true)
+
+
+def test_parabolas_are_found_again() -> None:
+    rng = np.random.default_rng(2)
+    u = rng.standard_normal((200, 4))
+    first, second = np.triu_indices(4)
+    true = rng.standard_normal((5, 1 + 4 + first.size))
+    values = true @ np.column_stack([np.ones(200), u, u[:, first] * u[:, second]]).T
+    assert np.allclose(_fit_parabolas(u, values), true, atol=2e-3)
+
+
+def drawn_surface(rng: np.random.Generator, moves: int) -> ResponseSurface:
+    """Return a surface of random numbers, of two linear coordinates and two waves."""
+    m = 9
+    some = rng.standard_normal
+    return ResponseSurface(
+        some(moves),
+        np.exp(some(moves)),
+        some(m),
+        some((m, moves)),
+        some((m, moves * (moves + 1) // 2)),
+        some((m, 2)),
+        some(2),
+        some((2, moves)),
+        some((m, 2)),
+        0,
+    )
+
+
+def test_a_likelihood_has_the_residuals_of_its_surface() -> None:
+    """In ln c, with the offset from its centre, and a truck that does not follow the bridge."""
+    rng = np.random.default_rng(4)
+    sigma = np.array([0.3, 0.6])
+    surface = drawn_surface(rng, 4)
+    terms, linearised = of_surface(surface, sigma)
+    for _ in range(5):
+        y = surface.centre + surface.size * rng.standard_normal(4)
+        truck, waves = rng.standard_normal(2), rng.standard_normal(2)
+        u = (y - surface.centre) / surface.size
+        apart = surface.linear @ (truck - surface.at - surface.follow @ u) + surface.waves @ waves
+        bridge = np.append(y[0], np.exp(-sigma * y[1:3]))
+        v = to_surface_coordinates(terms, bridge)
+        place = y[3] - surface.centre[3]
+        about = to_surface_coordinates(terms, terms.about)
+        size = np.linalg.solve(terms.directions, np.append(v - about, place))
+        first, second = np.triu_indices(4)
+        bends = terms.shapes @ (size[first] * size[second])
+        x = np.concatenate([v, truck, waves, [place], bends])
+        found = linearised.residual + linearised.jacobian @ (x - linearised.centre)
+        assert np.allclose(found, residuals_of(surface, y[None, :])[0] + apart)
