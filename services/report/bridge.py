@@ -199,12 +199,20 @@ def _one_by_one(
     baseline: Estimate | None,
     language: Language,
 ) -> Iterator[str]:
-    """Yield a sentence on the scatter of the good crossings of the campaign at weak elements."""
+    """Yield a sentence on the scatter of the good crossings of the campaign at weak elements.
+
+    Those that fusion left out are not among them.
+    """
+    state = view.state
+    left_out = set() if state is None else {one.crossing_id for one in state.crossings_left_out}
     own = {one.crossing_id for one in crossings if one.realm == crossings[-1].realm}
     good = [
         one
         for one in view.crossings
-        if one.verdict == "good" and one.interval_nm2 is not None and one.crossing_id in own
+        if one.verdict == "good"
+        and one.interval_nm2 is not None
+        and one.crossing_id in own
+        and one.crossing_id not in left_out
     ]
     if view.comparison is None or len(good) < 2:
         return

@@ -34,7 +34,7 @@ def history_section(past: BridgeHistory, prefix: str, language: Language = ENGLI
         "history.from_to",
         how_much=_how_much(past, language),
         first=utc_day(past.periods[0].begin_s),
-        last=utc_day(past.periods[-1].end_s),
+        last=utc_day(past.periods[-1].end_s - 1.0),
     )
     label = language.text("history.figure", summary=wording)
     how = language.text("history.how", unit=language.text(past.unit))

@@ -25,6 +25,7 @@ ul { padding-left: 5mm; }
 table { border-collapse: collapse; width: 100%; margin: 1.5mm 0; font-size: 9pt; }
 th, td { text-align: left; padding: 0.6mm 2mm 0.6mm 0; vertical-align: top;
   border-bottom: 0.5pt solid #d5dade; overflow-wrap: anywhere; }
+thead th { overflow-wrap: normal; }
 .facts th { width: 30mm; font-weight: normal; color: #5b6570; }
 tr.weak td { font-weight: bold; background: #fdf0d5; }
 figure { margin: 1.5mm 0; }

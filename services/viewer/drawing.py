@@ -114,14 +114,15 @@ def draw_verdict(
 ) -> None:
     """Write the verdict below a heading: a word if it is good, a banner with reasons if not.
 
-    The first of the `sentences` stands next to a good one.
+    The first of the `sentences` stands next to a good one, with the number of the others.
     """
     words: dict[str, Any] = {"fontsize": 9.5, "va": "top"}
     if verdict == "good":
         colour = VERDICT_COLOURS["good"]
         figure.text(LEFT, top, "verdict: good", color=colour, fontweight="bold", **words)
         if sentences:
-            short = textwrap.shorten(sentences[0], width=100, placeholder=" …")
+            more = f" (and {len(sentences) - 1} more)" if len(sentences) > 1 else ""
+            short = textwrap.shorten(sentences[0], width=100 - len(more), placeholder=" …") + more
             figure.text(LEFT + 0.12, top, short, color=INK, parse_math=False, **words)
         return
     height = 0.40 / figure.get_figheight()

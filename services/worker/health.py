@@ -17,7 +17,7 @@ _LONGEST_NOTE = 1000
 _CAUSES = {
     "for_process": "for a process",
     "for_validation": "for a site validation",
-    "for_data": "for missing samples",
+    "for_data": "for missing samples or for the recording to end",
 }
 """Causes by the fields of `WaitingCounts`."""
 

@@ -802,7 +802,8 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, str | bytes]], str]] = {
         lambda: pair(with_times(ACCEL, ACCEL["time_s"] + 3600)),
         (
             "gps_00.csv: begins 1 h before accel_00.csv, which looks like another time zone; "
-            "the clocks must agree: set offset_s = 3600 in its"
+            "the clocks must agree: in [file.time] of a map (--map) set offset_s = 3600 if the "
+            "positions are wrong, or -3600 for accel_00.csv if it is"
         ),
     ),
     "local times": (

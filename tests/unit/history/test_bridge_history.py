@@ -102,7 +102,7 @@ def past(tmp_path_factory: pytest.TempPathFactory) -> BridgeHistory:
 def test_report_page_shows_months_elements_and_alarms(past: BridgeHistory) -> None:
     found = Seen(history_section(past, "h-"))
     assert "The bridge over time" in found.text
-    assert "34 crossings in 2 months, 2026-03-01 to 2026-05-01." in found.text
+    assert "34 crossings in 2 months, 2026-03-01 to 2026-04-30." in found.text
     assert "No alarm" not in found.text
     never = "Not monitored: driveby alarm check has not been run on this bridge."
     assert never in found.text
