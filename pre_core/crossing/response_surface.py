@@ -27,8 +27,6 @@ POINTS = 640
 many the remainder of third order enters the slopes as if it were knowledge of the bridge."""
 _SWINGING = 40
 """Number of these points whose waves of the initial vibration are computed for their mixture."""
-_OF_FIRST_MODE = 2
-"""Number of coordinates of the initial vibration whose waves move; the others' decay fast."""
 _LEAST_WAVE = 0.03
 """Smallest wave that is kept, in standard deviations of a residual."""
 _LEAST_SIZE = 1e-9
@@ -103,7 +101,7 @@ def response_surface(
     """
     where = posterior.layout(problem)
     y = found.state.y.copy()
-    swing = where.swing.start + np.arange(_OF_FIRST_MODE)
+    swing = np.arange(where.swing.start, where.swing.stop)
     y[swing] = 0.0
     jacobian = jacobian[parts.rows]
     # The whole trajectory follows one coefficient, and its other coordinates are relative to it.
@@ -155,10 +153,10 @@ def _swing_waves(
     problem: PosteriorProblem, points: FloatArray, rows: NDArray[np.int64]
 ) -> FloatArray:
     """Return waves (m, r) whose covariance is that of the initial vibration at points (n, f)."""
-    first = posterior.layout(problem).swing.start
+    swing = posterior.layout(problem).swing
     residuals = posterior.all_rows(problem, points)[:, rows]
     waves = []
-    for place in range(first, first + _OF_FIRST_MODE):
+    for place in range(swing.start, swing.stop):
         swinging = points.copy()
         swinging[:, place] += 1.0
         waves.append(posterior.all_rows(problem, swinging)[:, rows] - residuals)

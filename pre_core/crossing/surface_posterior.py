@@ -37,10 +37,6 @@ _FIRST_POINTS = 320
 """Number of points of the first surface, which only says where the second is wanted."""
 _SHARE_OF_POINTS = 3
 """Weighted draws for each point, which is then rarely drawn twice."""
-_WALL = 4.0
-"""Weight in -2 ln p of the squared distance from the points beyond their own, by their covariance:
-parabolas may vanish where no point is."""
-_ROUNDED = 1e-12
 
 
 class SurfacePosterior(NamedTuple):
@@ -131,14 +127,10 @@ def _weighted(
     problem = found.problem
     kept = np.append(of.curved, place_of_offset(problem))
     centres = np.pad(problem.noise_slope, (0, found.state.y.size))[of.curved]
-    spread = np.cov(of.points.T) + _ROUNDED * np.eye(kept.size)
-    to_unit = np.linalg.inv(np.linalg.cholesky(spread)).T
 
     def target(y: FloatArray) -> FloatArray:
         squares = np.sum(residuals_of(of.surface, y) ** 2, axis=1)
         squares += np.sum((y[:, :-1] - centres) ** 2, axis=1)
-        distance = np.sum(((y - of.surface.centre) @ to_unit) ** 2, axis=1)
-        squares += _WALL * np.maximum(distance - kept.size, 0.0)
         return np.asarray(-0.5 / inflation**2 * squares)
 
     full = surrogate.coordinates(found, inflation)

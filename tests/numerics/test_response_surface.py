@@ -24,12 +24,12 @@ DRAWS = 16
 
 
 def vibration(found: Optimum, bridges: FloatArray, curved: NDArray[np.int64]) -> FloatArray:
-    """Return a root (m, 2 k) of the mean covariance of the first mode's waves on bridges (k, n)."""
-    first = posterior.layout(found.problem).swing.start
+    """Return a root (m, 6 k) of the mean covariance of all modes' waves on bridges (k, n)."""
+    swing = posterior.layout(found.problem).swing
     y = np.repeat(found.state.y[None, :], bridges.shape[0], axis=0)
     y[:, curved] = bridges
     apart = []
-    for place in (first, first + 1):
+    for place in range(swing.start, swing.stop):
         up, down = y.copy(), y.copy()
         up[:, place], down[:, place] = 0.5, -0.5
         apart.append(
@@ -44,11 +44,11 @@ def least_squares(
     """Return the least sum of squares at curved coordinates and offset, over all others in y.
 
     The residuals themselves are fitted again, without the priors of the curved coordinates; the
-    first mode of the vibration before the crossing is noise of the root `waves`.
+    vibration before the crossing is noise of the root `waves`.
     """
     where = posterior.layout(found.problem)
     rows = compliances.without_priors(found.problem, found.state.residual.size, of.curved)
-    place, swing = place_of_offset(found.problem), where.swing.start + np.arange(2)
+    place, swing = place_of_offset(found.problem), np.arange(where.swing.start, where.swing.stop)
     y = found.state.y.copy()
     y[of.curved] = curved[:-1]
     y[where.trajectory] += curved[-1] - y[place]
@@ -77,8 +77,9 @@ def test_the_surface_has_the_least_squares_of_the_residuals() -> None:
     waves = vibration(found, bridges, of.curved)
     true = np.array([least_squares(found, of, one, waves) for one in drawn])
     seen = np.sum(residuals_of(of.surface, drawn) ** 2, axis=1)
-    # In -2 ln p, which varies by four over these draws.
-    assert np.std(seen - true) < 0.5 * np.std(true)
+    # In -2 ln p: what is left is of third order, and the other sample of bridges.
+    assert np.std(seen - true) < 0.75 * np.std(true)
+    assert np.corrcoef(seen, true)[0, 1] > 0.7
 
 
 def test_parabolas_are_found_again() -> None:
