@@ -82,9 +82,14 @@ def place_of_offset(problem: PosteriorProblem) -> int:
 def residuals_of(surface: ResponseSurface, y: FloatArray) -> FloatArray:
     """Return residuals (k, m) at curved coordinates and offset y (k, n + 1), the others there."""
     u = (y - surface.centre) / surface.size
-    first, second = np.triu_indices(u.shape[1])
-    products = (u[:, first] * u[:, second]) @ surface.products.T
+    products = _products(u) @ surface.products.T
     return np.asarray(surface.constant + u @ surface.slopes.T + products)
+
+
+def _products(u: FloatArray) -> FloatArray:
+    """Return the products (k, pairs) u_i u_j, i <= j by rows, of moves (k, n)."""
+    first, second = np.triu_indices(u.shape[1])
+    return np.asarray(u[:, first] * u[:, second])
 
 
 def response_surface(
@@ -185,8 +190,7 @@ def _follow(
 
 def _fit_parabolas(u: FloatArray, values: FloatArray) -> FloatArray:
     """Return constant, slopes and products (m, 1 + n + pairs) of values (m, k) at u (k, n)."""
-    first, second = np.triu_indices(u.shape[1])
-    design = np.column_stack([np.ones(u.shape[0]), u, u[:, first] * u[:, second]])
+    design = np.column_stack([np.ones(u.shape[0]), u, _products(u)])
     normal = design.T @ design
     normal[1:, 1:] += _RIDGE * np.eye(normal.shape[0] - 1)
     return np.asarray(cho_solve(cho_factor(normal), design.T @ values.T).T)

@@ -79,7 +79,7 @@ def surface_posterior(found: Optimum, inflation: float, seed: int) -> SurfacePos
     widened = _WIDENED * inflation
     first = fitted(_points_of_normal(found, _FIRST_POINTS, widened, seed))
     wanted = _SHARE_OF_POINTS * POINTS
-    wide = _weighted(found, first, wanted, seed, widened, may_be_absent=False)
+    wide = draw_curved(found, first, wanted, seed, widened, may_be_absent=False)
     if not is_enough(wide.worth, wanted):
         return first
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 23,)))
@@ -109,21 +109,13 @@ def draw_curved(
     seed: int,
     inflation: float,
     report: Report = lambda stage, fraction: None,
-) -> WeightedDraws:
-    """Return weighted draws (k, n + 1) of the curved coordinates and the offset."""
-    return _weighted(found, of, draws, seed, inflation, report, may_be_absent=True)
-
-
-def _weighted(
-    found: Optimum,
-    of: SurfacePosterior,
-    draws: int,
-    seed: int,
-    inflation: float,
-    report: Report = lambda stage, fraction: None,
     *,
-    may_be_absent: bool,
+    may_be_absent: bool = True,
 ) -> WeightedDraws:
+    """Return weighted draws (k, n + 1) of the curved coordinates and the offset.
+
+    Unless they `may_be_absent`, springs and bearings are present in all.
+    """
     problem = found.problem
     kept = np.append(of.curved, place_of_offset(problem))
     centres = np.pad(problem.noise_slope, (0, found.state.y.size))[of.curved]
