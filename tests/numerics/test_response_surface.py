@@ -1,5 +1,7 @@
 """Response surfaces of a crossing: true to its residuals where the posterior is."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -65,9 +67,12 @@ def least_squares(
     return minimise(moved, y[free], 40, 1e-3).state.objective
 
 
-@pytest.mark.slow
-def test_the_surface_has_the_least_squares_of_the_residuals() -> None:
-    """At draws of the posterior that it was not fitted to, all other coordinates fitted again."""
+@cache
+def of_surface_and_fit() -> tuple[FloatArray, FloatArray]:
+    """Return the least squares (k,) of the surface, and of residuals fitted again.
+
+    At draws of the posterior that it was not fitted to, with all other coordinates free.
+    """
     found = at_its_truth(TWIN)
     of = surface_posterior(found, 1.0, seed=1)
     weighted = draw_curved(found, of, 1000, 7, 1.0)
@@ -77,9 +82,21 @@ def test_the_surface_has_the_least_squares_of_the_residuals() -> None:
     waves = vibration(found, bridges, of.curved)
     true = np.array([least_squares(found, of, one, waves) for one in drawn])
     seen = np.sum(residuals_of(of.surface, drawn) ** 2, axis=1)
-    # In -2 ln p: what is left is of third order, and the other sample of bridges.
+    return seen, true
+
+
+@pytest.mark.slow
+def test_the_surface_follows_the_least_squares_of_the_residuals() -> None:
+    seen, true = of_surface_and_fit()
     assert np.std(seen - true) < 0.75 * np.std(true)
     assert np.corrcoef(seen, true)[0, 1] > 0.7
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(reason="0.6: points are random, and the remainder is of third order")
+def test_the_surface_has_the_least_squares_of_the_residuals() -> None:
+    seen, true = of_surface_and_fit()
+    assert np.std(seen - true) < 0.5 * np.std(true)
 
 
 def test_parabolas_are_found_again() -> None:
