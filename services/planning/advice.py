@@ -1,6 +1,7 @@
 """The forecast of a survey in words: its resolution, the most useful change, its limits."""
 
 from collections.abc import Iterator
+from math import inf
 from typing import Final
 
 from pre_core.survey.detection import DETECTION_PROBABILITY
@@ -19,7 +20,7 @@ from services.planning.crossings import axles_of, has_declared_offset
 from services.planning.survey import MAX_CROSSINGS, PlanForecast, SurveyForecast
 
 _WORTH_NAMING: Final = 0.95
-"""Share of the plan's smallest loss below which an alternative's loss is worth a sentence."""
+"""Share of the plan's crossings or smallest loss below which an alternative is worth a sentence."""
 
 
 def advice(found: SurveyForecast) -> str:
@@ -97,23 +98,24 @@ def _of_the_others(found: SurveyForecast) -> str:
     ]
     better = sorted((one for one in same if _helps(one, planned)), key=_rank)
     if not better:
-        return "No other change that was tried here helps much."
-    best = better[0]
-    if best.needed_middle is None:
-        smallest = best.expected.smallest_loss[best.middle]
-        gain = f"then {found.question.crossings} detect a loss of {percent(smallest)}"
-    else:
-        verb = "detects" if best.needed_middle == 1 else "detect"
-        gain = f"then {count_of(best.needed_middle, 'crossing')} {verb} it, and {_ends(best)}"
-    sentence = f"What helps most: {_change(best)}; {gain}."
-    if len(better) > 1:
-        next_best = better[1]
-        smallest = next_best.expected.smallest_loss[next_best.middle]
-        sentence += (
-            f" Next best: {_change(next_best)} ({found.question.crossings} crossings then detect "
-            f"a loss of {percent(smallest)})."
-        )
+        return "No other change of truck, load, direction or sensors helps much."
+    best, *rest = better
+    sentence = f"What helps most: {_change(best)}; then {_gain(best, found)}."
+    if rest:
+        sentence += f" Next best: {_change(rest[0])} (then {_gain(rest[0], found)})."
     return sentence
+
+
+def _gain(one: PlanForecast, found: SurveyForecast) -> str:
+    """Return what an alternative achieves, by the column of the table in which it is better."""
+    if one.needed_middle is None or _needed(one) == _needed(found.planned):
+        smallest = percent(one.expected.smallest_loss[one.middle])
+        return f"{_detecting(found.question.crossings)} a loss of {smallest}"
+    return f"{_detecting(one.needed_middle)} it, and {_ends(one)}"
+
+
+def _detecting(crossings: int) -> str:
+    return f"{count_of(crossings, 'crossing')} {'detects' if crossings == 1 else 'detect'}"
 
 
 def _change(one: PlanForecast) -> str:
@@ -123,12 +125,31 @@ def _change(one: PlanForecast) -> str:
 
 
 def _helps(one: PlanForecast, planned: PlanForecast) -> bool:
+    """Return whether an alternative needs clearly fewer crossings, or no more and detects more."""
+    (middle, ends), (planned_middle, planned_ends) = _needed(one), _needed(planned)
+    if middle < _WORTH_NAMING * planned_middle:
+        return True
+    if middle > planned_middle:
+        return False
+    if ends < _WORTH_NAMING * planned_ends:
+        return True
     limit = _WORTH_NAMING * planned.expected.smallest_loss[planned.middle]
-    return bool(one.expected.smallest_loss[one.middle] < limit)
+    return ends <= planned_ends and bool(one.expected.smallest_loss[one.middle] < limit)
 
 
-def _rank(one: PlanForecast) -> float:
-    return float(one.expected.smallest_loss[one.middle])
+def _rank(one: PlanForecast) -> tuple[float, float, float]:
+    """Return the columns of the table that rank it: `needed`, `ends` and `smallest`."""
+    return (*_needed(one), float(one.expected.smallest_loss[one.middle]))
+
+
+def _needed(one: PlanForecast) -> tuple[float, float]:
+    """Return the crossings needed at midspan and at both ends; infinite beyond MAX_CROSSINGS.
+
+    The ends count only where midspan is detected.
+    """
+    if one.needed_middle is None:
+        return inf, inf
+    return one.needed_middle, inf if one.needed_ends is None else one.needed_ends
 
 
 def warnings(found: SurveyForecast) -> Iterator[str]:

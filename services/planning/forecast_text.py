@@ -102,11 +102,21 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     yield "equal single tyres: on equal tracks, to a centimetre;"
     yield "at … t: only if legal axle and total loads allow it;"
     yield "in the other direction: in the opposite lane;"
-    yield "… elements: fewer, longer ones"
+    yield "… elements: fewer, longer ones;"
+    yield from _not_advised(found)
     yield ""
     for line in warnings(found):
         yield f"warning: {line}"
     yield advice(found)
+
+
+def _not_advised(found: SurveyForecast) -> Iterator[str]:
+    """Yield which rows the advice leaves out, and why."""
+    if found.planned.plan.site.vehicles[0].tandem is None:
+        yield "the advice leaves out tandems, whose forecast is too optimistic, and"
+        yield "fewer elements, as a loss in one of them is more damage"
+    else:
+        yield "the advice leaves out fewer elements, as a loss in one is more damage"
 
 
 def _aligned(rows: list[list[str]]) -> Iterator[str]:

@@ -1,0 +1,111 @@
+"""The advice of a forecast ranks alternatives as the table of the forecast does."""
+
+import re
+from itertools import pairwise, product
+
+import numpy as np
+import pytest
+
+from services.planning.advice import advice
+from services.planning.alternatives import as_planned, with_noise
+from services.planning.crossings import PlannedRoad
+from services.planning.forecast_text import lines_of
+from services.planning.survey import PlanForecast, SurveyExpectation, SurveyForecast, SurveyQuestion
+from services.simulation.drive import paper_site
+
+SITE = with_noise(paper_site(), (25.0,) * 4)
+NONE_HELPS = "No other change of truck, load, direction or sensors helps much."
+Row = tuple[int | None, int | None, float]
+"""Columns `needed`, `ends` and `smallest` of the table."""
+
+
+def forecast(planned: Row, crossings: int = 12, **others: Row) -> SurveyForecast:
+    plan = as_planned(SITE, 10.0)
+
+    def row(name: str, values: Row) -> PlanForecast:
+        middle, ends, smallest = values
+        wide = np.full(7, 0.2)
+        expected = SurveyExpectation(crossings, wide, 0.1, wide, wide, np.full(7, smallest))
+        return PlanForecast(plan._replace(name=name), expected, expected, 3, middle, ends)
+
+    outlook = row("as planned", planned)
+    return SurveyForecast(
+        SurveyQuestion(0.2, crossings, 10.0, (10.0, 10.0)),
+        PlannedRoad("A", 0.12),
+        outlook,
+        tuple(row(name, values) for name, values in others.items()),
+        (),
+        None,
+        (outlook.expected,),
+        40.0,
+    )
+
+
+def named(found: SurveyForecast) -> list[str]:
+    """Return the alternatives that the advice names, the best one first."""
+    return re.findall(r"(?:helps most:|Next best:) (\w+)", advice(found))
+
+
+def test_fewer_crossings_come_before_a_smaller_loss() -> None:
+    """The alternative with the smallest loss at 12 crossings never detects the loss in question."""
+    found = forecast((None, None, 0.5), few=(20, None, 0.3), steep=(None, None, 0.25))
+    assert named(found) == ["few", "steep"]
+    assert "most: few; then 20 crossings detect it, and the ends would take more than 300." in (
+        advice(found)
+    )
+    assert "Next best: steep (then 12 crossings detect a loss of 25 %)." in advice(found)
+
+
+def test_alternative_that_needs_more_crossings_is_not_advised() -> None:
+    assert NONE_HELPS in advice(forecast((9, 40, 0.2), more=(15, 60, 0.1), none=(None, None, 0.1)))
+
+
+def test_alternative_that_alone_detects_the_loss_is_advised() -> None:
+    """It need not detect a smaller loss at the planned number of crossings."""
+    assert named(forecast((None, None, 0.5), late=(250, None, 0.5))) == ["late"]
+
+
+def test_hardly_fewer_crossings_are_not_worth_a_sentence() -> None:
+    assert NONE_HELPS in advice(forecast((100, None, 0.3), same=(99, None, 0.3)))
+    assert named(forecast((100, None, 0.3), ends=(99, 200, 0.3))) == ["ends"]
+
+
+def test_ties_are_ranked_by_the_ends_then_by_the_loss() -> None:
+    ties = forecast((9, None, 0.3), a=(5, None, 0.1), b=(5, 40, 0.2), c=(5, 40, 0.15))
+    assert named(ties) == ["c", "b"]
+    same = forecast((9, 40, 0.3), same=(9, 40, 0.2))
+    assert "helps most: same; then 12 crossings detect a loss of 20 %." in advice(same)
+
+
+def test_single_crossing_has_its_verb() -> None:
+    one = forecast((9, None, 0.3), one=(1, 1, 0.1))
+    assert "then 1 crossing detects it, and the ends need no more." in advice(one)
+    alone = forecast((None, None, 0.3), 1, better=(None, None, 0.2))
+    assert "then 1 crossing detects a loss of 20 %." in advice(alone)
+
+
+@pytest.mark.parametrize("planned", [(9, 40, 0.2), (9, None, 0.2), (None, None, 0.2)])
+def test_no_row_of_the_table_beats_the_advised_one(planned: Row) -> None:
+    """In every pair of alternatives, by the columns that the table prints."""
+    rows = list(product((4, 9, 30, None), (None, 40, 60), (0.1, 0.2, 0.3)))
+    for a, b in product(rows, rows):
+        names = named(forecast(planned, a=a, b=b))
+        table = {"a": a, "b": b}
+        for better, worse in pairwise(names):
+            assert key(table[better]) <= key(table[worse])
+        if names:
+            assert key(table[names[0]]) <= key(planned)
+        left_out = table.keys() - set(names)
+        assert not [one for one in left_out if key(table[one])[0] < key(planned)[0]]
+
+
+def key(row: Row) -> tuple[float, float, float]:
+    middle, ends, smallest = row
+    if middle is None:
+        return (np.inf, np.inf, smallest)
+    return (middle, np.inf if ends is None else ends, smallest)
+
+
+def test_table_names_the_rows_without_advice() -> None:
+    text = " ".join(lines_of(forecast((9, 40, 0.2))))
+    assert "the advice leaves out tandems, whose forecast is too optimistic, and fewer el" in text
