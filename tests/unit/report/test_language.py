@@ -51,6 +51,25 @@ def test_each_language_has_every_sentence_with_its_values(language: Language) ->
         assert all(text.strip() for text in sentences.values())
 
 
+NAMED = {
+    "axle": ("Achs", "achs"),
+    "clock": ("Uhr",),
+    "receiver": ("Empfänger",),
+    "span": ("Stützweite",),
+    "traffic": ("Verkehr",),
+    "wheelbase": ("Radstand",),
+}
+"""Things to check that the remedy of a reason names in each language."""
+
+
+@pytest.mark.parametrize("code", Reason)
+def test_german_remedy_names_what_the_english_one_names(code: Reason) -> None:
+    for english, words in NAMED.items():
+        is_named = english in ENGLISH.advice[code]
+        german = GERMAN.advice[code]
+        assert any(word in german for word in words) == is_named, f"{english}: {german}"
+
+
 def test_numbers_are_written_as_in_the_language() -> None:
     assert GERMAN.number(-1234.5, ",.1f") == "−1.234,5"
     assert ENGLISH.number(-1234.5, ",.1f") == "−1,234.5"
