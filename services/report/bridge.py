@@ -346,7 +346,7 @@ def _no_finding(crossings: Sequence[CrossingResult], language: Language) -> Brid
     which = language.choice("nothing.suspect", total)
     if suspect < total:
         which = language.choice("nothing.mixed", suspect, total=total)
-    which += " " + language.choice("nothing.listed", suspect)
+    which += " " + language.choice("nothing.drawn", suspect)
     return BridgeFinding("doubtful", language.text("finding.nothing_yet"), (which, why))
 
 

@@ -725,7 +725,9 @@ def test_suspect_crossings_that_were_not_used_are_not_called_nothing(site: Site)
     rejected = some_crossing("b", verdict="rejected", reasons=("sensor_saturated",), entry=60.0)
     alone = reported(site, results_of(site, suspect))
     assert ("class", "finding doubtful") in alone.attributes
-    assert "The only crossing was suspect. Its values are listed in the evidence" in alone.text
+    assert "The only crossing was suspect. A figure in the evidence shows its values" in alone.text
+    assert ("aria-label", "EI and road profile of 1 crossings") in alone.attributes
+    assert "EI (GN·m²)" not in alone.text  # the sentence promises no table, and there is none
     assert "nothing was measured" not in alone.text
     both = reported(site, results_of(site, suspect, rejected)).text
     assert "None of the 2 crossings is good, 1 is suspect." in both
