@@ -66,6 +66,15 @@ class PeriodComparison(NamedTuple):
     changes: tuple[ElementChange, ...]
 
 
+class StoredBaseline(NamedTuple):
+    """An earlier state of a bridge, to which a history is related."""
+
+    name: str
+    """Name of its results file."""
+    mean_nm2: tuple[float, ...]
+    """EI of each element in N·m²."""
+
+
 class BridgeHistory(NamedTuple):
     """History of a bridge in one realm."""
 
@@ -77,6 +86,8 @@ class BridgeHistory(NamedTuple):
     watch: MonitoringState
     comparison: PeriodComparison | None = None
     """Comparison of two periods, for a bridge without monitoring."""
+    baseline: StoredBaseline | None = None
+    """Baseline that the site file or the caller names."""
 
     @property
     def active_alarms(self) -> tuple[Alarm, ...]:

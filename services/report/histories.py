@@ -5,7 +5,12 @@ from pathlib import Path
 
 from services.common.language import ENGLISH, Language
 from services.execution.blas import one_blas_thread
-from services.history.bridge_history import BridgeHistory, bridge_history, change_over_time
+from services.history.bridge_history import (
+    BridgeHistory,
+    StoredBaseline,
+    bridge_history,
+    change_over_time,
+)
 from services.history.history_store import bridges_of
 from services.history.periods import Unit
 from services.report.alarm_words import alarm_sentence
@@ -40,6 +45,10 @@ def with_histories(
 
 def with_history(report: BridgeReport, past: BridgeHistory, language: Language) -> BridgeReport:
     """Return a report with a history, whose alarms and changes its finding must not contradict."""
+    before = report.before
+    if before is not None:
+        means = tuple(float(ei) for ei in before.estimate.mean)
+        past = past._replace(baseline=StoredBaseline(before.name, means))
     report = report._replace(past=past)
     finding, cautions = report.finding, list(report.cautions)
     change = change_over_time(past, language)

@@ -3,14 +3,18 @@
 from collections.abc import Iterator
 
 import matplotlib
-import numpy as np
 
 from services.common.language import ENGLISH, Language, utc_day
 from services.history.bridge_history import BridgeHistory, statements
 from services.report.alarm_words import alarm_sentence
 from services.report.html import Html, inlined_svg, table, tag
 from services.viewer.drawing import STYLE, figure_bytes
-from services.viewer.history_figure import HistoryView, draw_history, history_view
+from services.viewer.history_figure import (
+    HistoryView,
+    draw_history,
+    history_view,
+    reference_sentence,
+)
 
 
 def history_summary(past: BridgeHistory, language: Language = ENGLISH) -> str:
@@ -37,7 +41,8 @@ def history_section(past: BridgeHistory, prefix: str, language: Language = ENGLI
         last=utc_day(past.periods[-1].end_s - 1.0),
     )
     label = language.text("history.figure", summary=wording)
-    how = language.text("history.how", unit=language.text(past.unit))
+    reference = reference_sentence(drawn, language)
+    how = language.text("history.how", unit=language.text(past.unit), reference=reference)
     return tag(
         "section",
         tag("h2", language.text("history.heading")),
@@ -79,25 +84,27 @@ def _alarms(past: BridgeHistory, language: Language) -> Iterator[Html]:
 
 
 def _elements(drawn: HistoryView, language: Language) -> Html:
-    """Return the table of medians, and of the newest period."""
+    """Return the table of the newest period, and of what it is related to."""
     newest = drawn.points[-1]
+    references = [drawn.reference(n) for n in range(len(newest.mean))]
+    name, unit = references[0].name, language.text(drawn.unit)
+    which = "baseline" if references[0].is_baseline else "first"
     heads = [
         language.text("table.element"),
-        language.text("history.median", unit=language.text(f"{drawn.unit}s")),
-        language.text("history.newest", unit=language.text(drawn.unit)),
+        language.text(f"history.column.{which}", name=name, unit=unit),
+        language.text("history.newest", unit=unit),
         language.text("table.interval"),
-        language.text("history.of_median"),
+        language.text(f"history.ratio.{which}", unit=unit),
     ]
     rows = []
-    for n, mean in enumerate(newest.mean):
-        usual = float(np.median([p.mean[n] for p in drawn.points if len(p.mean) > n]))
+    for n, (mean, reference) in enumerate(zip(newest.mean, references, strict=True)):
         rows.append(
             [
                 str(n + 1),
-                language.number(usual / 1e9, ".2f"),
+                language.number(reference.ei_nm2 / 1e9, ".2f"),
                 language.number(mean / 1e9, ".2f"),
                 language.text("cell.range", low=newest.low[n] / 1e9, high=newest.high[n] / 1e9),
-                language.number(mean / usual, ".3f"),
+                language.number(mean / reference.ei_nm2, ".3f"),
             ]
         )
     return table(heads, rows)

@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from services.common.language import ENGLISH, Language, utc_day
-from services.history.bridge_history import BridgeHistory, Statement, statements
+from services.history.bridge_history import BridgeHistory, Statement, StoredBaseline, statements
+from services.history.periods import Unit, begin_of, period_name
 from services.viewer.crossing_view import VERDICT_COLOURS
 from services.viewer.drawing import (
     BAR_EDGE,
@@ -74,15 +75,44 @@ class AlarmMark(NamedTuple):
     """Note of the acknowledgement."""
 
 
+class HistoryReference(NamedTuple):
+    """The EI of an element that is 100 %."""
+
+    name: str
+    """Period, or name of the baseline's results file."""
+    is_baseline: bool
+    ei_nm2: float
+
+    def label(self, language: Language) -> str:
+        """Return its name next to an axis."""
+        return language.text("history.baseline") if self.is_baseline else self.name
+
+
 class HistoryView(NamedTuple):
     """Data of the figure of a bridge's history."""
 
     bridge: str
-    unit: str
+    unit: Unit
     points: tuple[PeriodPoint, ...]
     marks: tuple[AlarmMark, ...]
     statements: tuple[Statement, ...]
     """Sentences where no alarm stands."""
+    baseline: StoredBaseline | None = None
+
+    def reference(self, n: int) -> HistoryReference:
+        """Return what element `n`, from 0, is related to: the baseline, else the first period.
+
+        That is the first period with a good state of as many elements as the newest one. A loss in
+        most periods is therefore a loss here, which it is not against a median of all periods.
+        """
+        elements = len(self.points[-1].mean)
+        if self.baseline is not None and n < elements == len(self.baseline.mean_nm2):
+            return HistoryReference(self.baseline.name, True, self.baseline.mean_nm2[n])
+        known = [point for point in self.points if len(point.mean) > n]
+        alike = [point for point in known if len(point.mean) == elements] or known
+        first = next((point for point in alike if point.verdict == "good"), alike[0])
+        name = period_name(begin_of(first.time_s, self.unit), self.unit)
+        return HistoryReference(name, False, first.mean[n])
 
 
 def history_figure(path: Path, past: BridgeHistory) -> None:
@@ -121,7 +151,8 @@ def history_view(past: BridgeHistory) -> HistoryView:
         )
         for alarm in past.alarms
     )  # fmt: skip
-    return HistoryView(past.bridge, past.unit, tuple(points), marks, tuple(statements(past)))
+    sentences = tuple(statements(past))
+    return HistoryView(past.bridge, past.unit, tuple(points), marks, sentences, past.baseline)
 
 
 def draw_history(
@@ -129,7 +160,7 @@ def draw_history(
 ) -> Figure:
     """Return the figure, to be drawn in `STYLE`: a panel per element, with one scale.
 
-    Values are per cent of each element's own median, so that elements can be compared. The
+    Values are per cent of each element's own reference, so that elements can be compared. The
     sentences of alarms and of monitoring in the heading are those of the view.
     """
     elements = max((len(point.mean) for point in history.points), default=0)
@@ -173,6 +204,8 @@ def _heading(history: HistoryView, language: Language) -> list[tuple[str, str]]:
     many = len(history.points)
     unit = language.text(history.unit if many == 1 else f"{history.unit}s")
     lines = [(language.choice("history.figure_bars", many, unit=unit), MUTED)]
+    if history.points:
+        lines.append((reference_sentence(history, language), MUTED))
     for mark in history.marks:
         if not mark.acknowledged:
             wording = language.text("history.figure_alarm", alarm=mark.sentence)
@@ -191,6 +224,14 @@ def _heading(history: HistoryView, language: Language) -> list[tuple[str, str]]:
     return lines
 
 
+def reference_sentence(history: HistoryView, language: Language) -> str:
+    """Return what 100 % is; the first element stands for all."""
+    reference = history.reference(0)
+    which = "baseline" if reference.is_baseline else "first"
+    unit = language.text(history.unit)
+    return language.text(f"history.reference.{which}", name=reference.name, unit=unit)
+
+
 def _short(text: str) -> str:
     return text if len(text) <= _MAX_CHARACTERS else text[: _MAX_CHARACTERS - 1] + "…"
 
@@ -206,22 +247,18 @@ def _limits(history: HistoryView, elements: int) -> tuple[float, float]:
     good = [point for point in history.points if point.verdict == "good"]
     ends = [90.0, 110.0]
     for n in range(elements):
-        usual = _usual(history, n)
+        whole = history.reference(n).ei_nm2
         for point in (point for point in good or history.points if len(point.mean) > n):
-            ends += [100.0 * point.low[n] / usual, 100.0 * point.high[n] / usual]
+            ends += [100.0 * point.low[n] / whole, 100.0 * point.high[n] / whole]
     low, high = min(ends), max(ends)
     margin = 0.05 * (high - low)
     return max(0.0, low - margin), min(high + margin, _MAX_PER_CENT)
 
 
-def _usual(history: HistoryView, n: int) -> float:
-    return float(np.median([p.mean[n] for p in history.points if len(p.mean) > n]))
-
-
 def _draw_element(
     axes: Axes, history: HistoryView, n: int, limits: tuple[float, float], language: Language
 ) -> None:
-    usual = _usual(history, n)
+    reference = history.reference(n)
     axes.axhline(100.0, color=MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
     for is_good in (True, False):
         some = [p for p in history.points if len(p.mean) > n and (p.verdict == "good") == is_good]
@@ -230,7 +267,7 @@ def _draw_element(
         colour = BAR_EDGE if is_good else "#8a8f94"
         times = _dates(p.time_s for p in some)
         mean, low, high = (
-            np.array([100.0 * getattr(p, name)[n] / usual for p in some])
+            np.array([100.0 * getattr(p, name)[n] / reference.ei_nm2 for p in some])
             for name in ("mean", "low", "high")
         )
         axes.vlines(times, low, high, color=colour, linewidth=1.6, alpha=0.75)
@@ -259,7 +296,8 @@ def _draw_element(
     axes.set_axisbelow(True)
     # Outside the panel, as points may be anywhere within it.
     axes.annotate(
-        f"100 %:\n{language.number(usual / 1e9, '#.3g')} GN·m²", (0.0, 0.5),
+        f"100 %:\n{reference.label(language)}\n"
+        f"{language.number(reference.ei_nm2 / 1e9, '#.3g')} GN·m²", (0.0, 0.5),
         xycoords="axes fraction", xytext=(-6, -8),
         textcoords="offset points", ha="right", va="top", fontsize=7, color=MUTED,
     )  # fmt: skip

@@ -21,11 +21,12 @@ from services.common.options import (
     output_folder_option,
     output_option,
     positional,
+    site_option,
 )
 
 if TYPE_CHECKING:
     from schemas.results import Results
-    from services.history.bridge_history import BridgeHistory, HistoryEntry
+    from services.history.bridge_history import BridgeHistory, HistoryEntry, StoredBaseline
     from services.history.periods import FusedPeriod, Unit
 
 _ADD = "add"
@@ -45,6 +46,9 @@ class HistoryOptions:
     realm: str | None = opt("realm of the bridge, if it is in several (default: the only one)")
     period: "Unit" = opt(
         "period of fusion (default: month)", default="month", choices=("day", "week", "month")
+    )
+    site: Path | None = site_option(
+        "site file whose baseline of the bridge is 100 % in figures (default: the first period)"
     )
     temperature: Path | None = file_option(
         "with add: CSV file of temperatures (time_s,temperature_deg_c[,bridge])", "T.csv"
@@ -170,6 +174,8 @@ def _show(options: HistoryOptions, bridge: str) -> int:
         past = bridge_history(folder, realm, bridge, unit, print, progress=progress)
     if not past.periods:
         raise InputError(f"{folder}: no crossing of {bridge} can be read")
+    if options.site is not None:
+        past = past._replace(baseline=_baseline(options.site, bridge))
     for line in _lines(past):
         print(line)
     if options.csv is not None:
@@ -184,6 +190,23 @@ def _show(options: HistoryOptions, bridge: str) -> int:
 
         return view_history(past, web=options.web)
     return 0
+
+
+def _baseline(site: Path, bridge: str) -> "StoredBaseline | None":
+    """Return the baseline that a site file names for a bridge; None if it names none."""
+    from schemas.site_file import load_site
+    from services.history.bridge_history import StoredBaseline
+    from services.ledger.baselines import stored_state
+
+    try:
+        known = load_site(site).bridge(bridge)
+    except KeyError:
+        raise InputError(f"{site}: has no bridge {bridge}") from None
+    if known.baseline is None:
+        return None
+    path = site.parent / known.baseline
+    elements = stored_state(path, known).elements.values()
+    return StoredBaseline(path.name, tuple(element.mean for element in elements))
 
 
 def _drawn(options: HistoryOptions, past: "BridgeHistory") -> Iterator[Path]:
@@ -251,7 +274,7 @@ def _csv(periods: "Sequence[FusedPeriod]") -> Iterator[str]:
 
 
 def _json(past: "BridgeHistory") -> str:
-    bridge, realm, unit, periods, alarms, watch, comparison = past
+    bridge, realm, unit, periods, alarms, watch, comparison, _ = past
     fields = {
         "bridge": bridge,
         "realm": realm,

@@ -12,7 +12,12 @@ import pytest
 from schemas.alarms import Acknowledgement, Alarm
 from schemas.results import ElementState, Results, results_json
 from services.cli import main as cli
-from services.history.bridge_history import BridgeHistory, bridge_history, statements
+from services.history.bridge_history import (
+    BridgeHistory,
+    StoredBaseline,
+    bridge_history,
+    statements,
+)
 from services.history.history_store import add_results
 from services.identification.bridge_state import RecentCrossings, add_crossings, state_of, usable
 from services.report.history_section import history_section, history_summary
@@ -107,19 +112,31 @@ def test_report_page_shows_months_elements_and_alarms(past: BridgeHistory) -> No
     never = "Not monitored: driveby alarm check has not been run on this bridge."
     assert never in found.text
     assert "From 2026-03 to 2026-04 no element changed by more than its 95 % interval" in found.text
-    assert "Median of all months (GN·m²) Newest month (GN·m²)" in found.text
+    assert "First month, 2026-03 (GN·m²) Newest month (GN·m²)" in found.text
+    assert "EI / first month" in found.text
+    assert (
+        "100 %: EI of each element in the first month with a usable result, 2026-03." in found.text
+    )
     assert found.tags.count("tr") == 1 + 7
     newest, before = (
         one.state.elements["EI_4"] for one in reversed(past.periods) if one.state is not None
     )
-    usual = (newest.mean + before.mean) / 2
-    row = f"4 {usual / 1e9:.2f} {newest.mean / 1e9:.2f} {newest.q025 / 1e9:.2f}–"
+    row = f"4 {before.mean / 1e9:.2f} {newest.mean / 1e9:.2f} {newest.q025 / 1e9:.2f}–"
     assert row in found.text
-    assert f"{newest.mean / usual:.3f} 5 " in found.text
+    assert f"{newest.mean / before.mean:.3f} 5 " in found.text
     assert found.tags.count("figure") == 1
     assert history_summary(past) == (
         "34 crossings in 2 months; not monitored for changes (see below)"
     )
+
+
+def test_report_page_relates_periods_to_a_baseline(past: BridgeHistory) -> None:
+    newest = [one.state for one in past.periods if one.state is not None][-1]
+    baseline = StoredBaseline("then.json", (20e9,) * 7)
+    text = Seen(history_section(past._replace(baseline=baseline), "h-")).text
+    assert "100 %: EI of each element in the baseline then.json." in text
+    assert "Baseline then.json (GN·m²) Newest month (GN·m²)" in text
+    assert f"{newest.elements['EI_4'].mean / 20e9:.3f} 5 20.00 " in text
 
 
 @pytest.fixture(scope="module")

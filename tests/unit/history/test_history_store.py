@@ -12,6 +12,8 @@ import pytest
 import zstandard
 
 from schemas.results import CrossingResult, Results, results_json
+from schemas.site import Site
+from schemas.site_file import site_toml
 from services.cli import main as cli
 from services.common.errors import InputError
 from services.common.parquet_files import encoded
@@ -29,6 +31,8 @@ from services.history.temperatures import temperatures_of
 from services.identification.bridge_state import RecentCrossings, add_crossings, state_of, usable
 from services.identification.observed import observation_of
 from tests.fleet import DAY_S, bridge_of, crossing_of, results_of, templates, trucks_of
+from tests.unit.viewer.found import results_of as results_of_site
+from tests.unit.viewer.found import some_crossing
 
 BEGIN_S = datetime(2026, 3, 2, tzinfo=UTC).timestamp()  # a Monday
 
@@ -266,6 +270,33 @@ def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert "sim-fleet  bridge-1  5          5     1       2026-03-02  2026-03-06" in (
         capsys.readouterr().out
     )
+
+
+def test_history_is_drawn_against_the_baseline_of_a_site_file(
+    tmp_path: Path, site: Site, capsys: pytest.CaptureFixture[str]
+) -> None:
+    history, then = tmp_path / "history", tmp_path / "then.json"
+    add_results(history, crossings(5))
+    then.write_text(results_json(results_of_site(site, some_crossing("a"), used="a")))
+    bridge = site.bridges[0].model_copy(update={"baseline": "then.json"})
+    known = tmp_path / "site.toml"
+    known.write_text(site_toml(site.model_copy(update={"bridges": (bridge,)})))
+    show = ["history", "bridge-1", "--history", str(history), "--figures", str(tmp_path)]
+    assert cli.main([*show, "--site", str(known)]) == 0
+    assert "the baseline then.json" in (tmp_path / "bridge-1-history.svg").read_text()
+    assert cli.main(show) == 0
+    assert (
+        "the first month with a usable result, 2026-03"
+        in (tmp_path / "bridge-1-history.svg").read_text()
+    )
+    then.unlink()
+    capsys.readouterr()
+    assert cli.main([*show, "--site", str(known)]) == 2
+    assert "then.json: no such file" in capsys.readouterr().err
+    other = bridge.model_copy(update={"id": "bridge-9"})
+    known.write_text(site_toml(site.model_copy(update={"bridges": (other,)})))
+    assert cli.main([*show, "--site", str(known)]) == 2
+    assert capsys.readouterr().err.endswith("site.toml: has no bridge bridge-1\n")
 
 
 @pytest.mark.parametrize(

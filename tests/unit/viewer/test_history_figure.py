@@ -3,7 +3,7 @@
 import matplotlib
 import numpy as np
 
-from services.history.bridge_history import Statement
+from services.history.bridge_history import Statement, StoredBaseline
 from services.viewer.crossing_view import VERDICT_COLOURS
 from services.viewer.drawing import STYLE
 from services.viewer.history_figure import AlarmMark, HistoryView, PeriodPoint, draw_history
@@ -48,6 +48,45 @@ def test_the_newest_estimate_is_in_its_panel_however_few_are_like_it() -> None:
     shown = np.asarray(points.get_ydata(), dtype=float)
     assert shown.min() < 67.0
     assert low < shown.min() < shown.max() < high
+
+
+def percents(history: HistoryView, element: int) -> list[float]:
+    """Return the drawn values of an element's good periods."""
+    axes = drawn(history).axes[element - 1]
+    points, *_ = [line for line in axes.lines if line.get_marker() == "o"]
+    return [round(float(value), 6) for value in np.asarray(points.get_ydata())]
+
+
+def test_loss_in_most_periods_is_a_loss_and_not_an_early_gain() -> None:
+    history = HistoryView("b-1", "week", weeks(1.0, 0.8, 0.8, 0.8, 0.8), (), ())
+    assert percents(history, 2) == [100.0, 80.0, 80.0, 80.0, 80.0]
+    texts = [text.get_text() for text in drawn(history).texts]
+    assert "100 %: EI of each element in the first week with a usable result, 2025-01-06" in texts
+    beside = [text.get_text() for text in drawn(history).axes[1].texts]
+    assert "100 %:\n2025-01-06\n16.0 GN·m²" in beside
+
+
+def test_reference_is_the_first_good_period_of_the_same_elements() -> None:
+    points = list(weeks(0.5, 0.6, 1.0, 0.9))
+    points[0] = points[0]._replace(verdict="suspect")
+    points[1] = points[1]._replace(mean=(9e9,), low=(8e9,), high=(10e9,))
+    history = HistoryView("b-1", "week", tuple(points), (), ())
+    assert percents(history, 2) == [100.0, 90.0]
+    assert history.reference(0).name == "2025-01-20"
+    doubtful = tuple(point._replace(verdict="suspect") for point in points[2:])
+    assert history._replace(points=doubtful).reference(1).ei_nm2 == 16e9
+
+
+def test_baseline_is_the_reference_if_its_elements_are_those() -> None:
+    baseline = StoredBaseline("then.json", (16e9, 20e9))
+    history = HistoryView("b-1", "week", weeks(1.0, 0.8), (), (), baseline)
+    assert percents(history, 2) == [80.0, 64.0]
+    figure = drawn(history)
+    texts = [text.get_text() for text in figure.texts]
+    assert "100 %: EI of each element in the baseline then.json" in texts
+    assert "100 %:\nbaseline\n20.0 GN·m²" in [text.get_text() for text in figure.axes[1].texts]
+    other = history._replace(baseline=StoredBaseline("then.json", (16e9,) * 3))
+    assert percents(other, 2) == [100.0, 80.0]
 
 
 def test_the_head_says_what_to_do_while_an_alarm_stands() -> None:
