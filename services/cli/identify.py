@@ -38,7 +38,12 @@ from services.execution.inline import InlineExecutor
 from services.execution.offline import identify_drives, messages_of_trucks, site_of
 from services.finding.order import index_messages
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
-from services.history.validation_files import passed_validations
+from services.history.validation_files import (
+    check_validations,
+    pairs_without_validation,
+    passed_validations,
+    validation_notes,
+)
 from services.identification.bridge_state import FusionSettings
 from services.identification.comparison import baseline_cautions
 from services.identification.methods import lacks_noise
@@ -73,6 +78,7 @@ def identify_command(
         draws: dict[str, Draws] = {}
         found = _found(request, draws, executing, console)
         _print(console, found, known)
+        _print_validation(console, found, known, asked.validations or CERTIFICATES)
         warn_of_shared_crossings(found.bridges, request.fusing.baselines)
         if asked.json is not None:
             write_atomically(asked.json, results_json(found))
@@ -99,7 +105,7 @@ def _check(
     executing: AbstractContextManager[CrossingExecutor | None] | None,
 ) -> None:
     """Raise InputError for inputs and outputs that cannot be used."""
-    check_certificates(asked.validations)
+    check_validations(asked.validations)
     for source in asked.recordings:
         if is_folder_of_recordings(source):
             raise InputError(
@@ -165,12 +171,6 @@ def _found(
             request.fusing,
             request.certificates,
         )
-
-
-def check_certificates(certificates: Path | None) -> None:
-    """Raise InputError for an invalid folder of validation records."""
-    if certificates is not None and not certificates.is_dir():
-        raise InputError(f"--validations: {certificates} is not a folder of validation records")
 
 
 def warn_of_no_noise(site: Site, method: str) -> None:
@@ -250,6 +250,14 @@ def _print(console: "Console", found: Results, site: Site) -> None:
             print_bridge(console, site.bridge(name), state)
         elif state.between_crossing_std is not None:
             console.print(_as_state(site.bridge(name), state), highlight=False)
+
+
+def _print_validation(console: "Console", found: Results, site: Site, folder: Path) -> None:
+    """Print which intervals no passed site validation covers, once for a bridge."""
+    for bridge in dict.fromkeys(crossing.bridge for crossing in found.crossings):
+        crossed = (crossing for crossing in found.crossings if crossing.bridge == bridge)
+        for note in validation_notes(folder, site, pairs_without_validation(crossed)):
+            console.print(f"[bold]{bridge}:[/] {note}", highlight=False, soft_wrap=True)
 
 
 def _as_state(bridge: Bridge, state: BridgeResult) -> str:

@@ -1,6 +1,6 @@
 """The command `driveby identify --into DIR`: an archive of recordings, stored as computed."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from itertools import chain
 from pathlib import Path
@@ -10,10 +10,11 @@ from schemas.results import CrossingResult, ResultHeader, results, results_json
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.site_file import load_site, parse_site
+from schemas.validation_records import VehicleBridgePair
 from services.catalogue.index import update_catalog
 from services.catalogue.positions import crossings_of
 from services.cli.bridge_table import print_bridge
-from services.cli.identify import check_certificates, warn_of_no_noise, warn_of_shared_crossings
+from services.cli.identify import warn_of_no_noise, warn_of_shared_crossings
 from services.cli.parsing import EXIT_SOMETHING_LOST
 from services.cli.settings import IdentifyOptions
 from services.common.errors import InputError
@@ -26,7 +27,12 @@ from services.execution.archive import ArchiveJob, ArchiveResult, identify_archi
 from services.execution.dispatch import CrossingExecutor
 from services.execution.inline import InlineExecutor
 from services.execution.result_store import BRIDGES, ResultStore
-from services.history.validation_files import passed_validations
+from services.history.validation_files import (
+    check_validations,
+    pairs_without_validation,
+    passed_validations,
+    validation_notes,
+)
 from services.identification.bridge_state import FusionSettings, with_common_shares
 from services.ledger.baselines import baselines_of
 from services.recordings.remote import (
@@ -56,18 +62,8 @@ def archive_command(
     Raise InputError for an output of single crossings, a file or folder that cannot be written, no
     site file, or a catalogue that cannot be created.
     """
-    site, json_path, certificates = options.site, options.json, options.validations
-    single = {"rrd": options.rrd, "draws": options.draws, "figures": options.figures}
-    for name, path in single.items():
-        if path is not None:
-            raise InputError(
-                f"--{name}: cannot be combined with --into; identify single recordings without it"
-            )
-    check_certificates(certificates)
-    if json_path is not None:
-        check_writable(json_path)
-    make_folder(into)
-    check_writable(into / BRIDGES)
+    site, json_path, folder = options.site, options.json, options.validations or CERTIFICATES
+    _check(options, into)
     problems: list[str] = []
     known = _site_of(options.recordings, site)
     recordings = _recordings(options.recordings, known, problems)
@@ -83,17 +79,24 @@ def archive_command(
             baselines_of(known, None if site is None else site.parent, options.baseline),
             options.fuse_suspect,
         ),
-        passed_validations(certificates or CERTIFICATES, known, settings),
+        passed_validations(folder, known, settings),
     )
     kept = ResultStore(into)
     crossings: list[CrossingResult] = []
+    unvalidated: set[VehicleBridgePair] = set()
+
+    def take(crossing: CrossingResult) -> None:
+        unvalidated.update(pairs_without_validation([crossing]))
+        if json_path is not None:
+            crossings.append(crossing)
+
     with executing as execution, progress_bar(console) as bar:
         task = bar.add_task("crossings", total=None)
         found = identify_archive(
             asked,
             InlineExecutor() if execution is None else execution,
             kept,
-            on_result=crossings.append if json_path is not None else lambda crossing: None,
+            on_result=take,
             report=lambda number: bar.update(task, description=count_of(number, "crossing")),
         )
     warn_of_shared_crossings(found.bridges, asked.fusing.baselines)
@@ -102,7 +105,26 @@ def archive_command(
     if json_path is not None:
         crossings.sort(key=lambda one: (one.entry_time, one.crossing_id))
         _write(json_path, header, with_common_shares(crossings, found.bridges), found)
-    return _print_summary(found, [*problems, *found.problems], known, into, console)
+    notes = {
+        name: list(validation_notes(folder, known, sorted(p for p in unvalidated if p[1] == name)))
+        for name in found.bridges
+    }
+    return _print_summary(found, notes, [*problems, *found.problems], known, into, console)
+
+
+def _check(options: IdentifyOptions, into: Path) -> None:
+    """Raise InputError for outputs that cannot be used; make the folder of results."""
+    single = {"rrd": options.rrd, "draws": options.draws, "figures": options.figures}
+    for name, path in single.items():
+        if path is not None:
+            raise InputError(
+                f"--{name}: cannot be combined with --into; identify single recordings without it"
+            )
+    check_validations(options.validations)
+    if options.json is not None:
+        check_writable(options.json)
+    make_folder(into)
+    check_writable(into / BRIDGES)
 
 
 def _site_of(sources: Sequence[Source], site: Path | None) -> Site:
@@ -160,7 +182,12 @@ def _write(
 
 
 def _print_summary(
-    found: ArchiveResult, problems: Sequence[str], site: Site, into: Path, console: "Console"
+    found: ArchiveResult,
+    notes: Mapping[str, list[str]],
+    problems: Sequence[str],
+    site: Site,
+    into: Path,
+    console: "Console",
 ) -> int:
     def write(line: str) -> None:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
@@ -170,6 +197,8 @@ def _print_summary(
             write(f"… and {count_of(len(found.bridges) - number, 'more bridge')}")
             break
         print_bridge(console, site.bridge(name), state)
+        for note in notes[name]:
+            write(note)
         console.print()
     for problem in problems:
         write(problem)

@@ -1,8 +1,10 @@
-"""Validation records of a folder: writing them, and the passed ones of a site's pairs."""
+"""Validation records of a folder: writing them, the passed ones, and what is not validated."""
 
 import logging
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.validation_records import (
@@ -15,6 +17,7 @@ from schemas.validation_records import (
 )
 from services.common.errors import InputError
 from services.common.files import make_folder, write_atomically
+from services.common.language import ENGLISH, Language
 
 _log = logging.getLogger(__name__)
 
@@ -25,6 +28,12 @@ def save(folder: Path, certificate: ValidationRecord) -> Path:
     path = validation_path(folder, certificate.hash)
     write_atomically(path, validation_json(certificate))
     return path
+
+
+def check_validations(folder: Path | None) -> None:
+    """Raise InputError for an invalid folder of validation records; None is valid."""
+    if folder is not None and not folder.is_dir():
+        raise InputError(f"--validations: {folder} is not a folder of validation records")
 
 
 def passed_validations(
@@ -47,3 +56,55 @@ def passed_validations(
         if is_ours and one.passed and one.hash == pair_hash(site, one.pair, settings):
             found[one.pair] = one.hash
     return found
+
+
+def pairs_without_validation(crossings: Iterable[CrossingResult]) -> list[VehicleBridgePair]:
+    """Return the pairs of results with intervals that name no validation record, each once."""
+    pairs = (
+        VehicleBridgePair(one.vehicle, one.bridge)
+        for one in crossings
+        if one.certificate is None and one.method == "pre" and one.parameters is not None
+    )
+    return list(dict.fromkeys(pairs))
+
+
+def validation_notes(
+    folder: Path, site: Site, pairs: Iterable[VehicleBridgePair], language: Language = ENGLISH
+) -> Iterator[str]:
+    """Yield a sentence for each pair of a bridge that failed, then one for all untried ones.
+
+    A pair whose record has passed since its identification has none. An unreadable record is a
+    warning.
+    """
+    untried = []
+    for pair in pairs:
+        record = _record_of(folder, site, pair)
+        if record is None:
+            untried.append(pair.vehicle)
+        elif not record.passed:
+            figures = record.figures
+            yield language.text(
+                "caution.validation_failed",
+                truck=pair.vehicle,
+                good=figures.good,
+                crossings=figures.crossings,
+                covered=figures.covered,
+                intervals=figures.intervals,
+            )
+    if untried:
+        yield language.text("caution.unvalidated", trucks=language.listed(untried))
+
+
+def _record_of(folder: Path, site: Site, pair: VehicleBridgePair) -> ValidationRecord | None:
+    """Return the record of a pair of the site; None without one."""
+    try:
+        path = validation_path(folder, pair_hash(site, pair, IdentificationSettings()))
+    except KeyError:  # the site file is another one
+        return None
+    if not path.exists():
+        return None
+    try:
+        return load_validation(path)
+    except InputError as error:
+        _log.warning("%s", error)
+        return None

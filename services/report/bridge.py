@@ -14,8 +14,10 @@ from schemas.site import Bridge, Site
 from services.common.errors import InputError
 from services.common.extras import check_extras
 from services.common.language import ENGLISH, Language
+from services.common.options import CERTIFICATES
 from services.execution.blas import one_blas_thread
 from services.history.bridge_history import BridgeHistory
+from services.history.validation_files import pairs_without_validation, validation_notes
 from services.identification.comparison import (
     Comparison,
     Estimate,
@@ -78,14 +80,16 @@ def bridge_reports(
     baseline: Path | None,
     beside: Path | None = None,
     language: Language = ENGLISH,
+    validations: Path = CERTIFICATES,
 ) -> list[BridgeReport]:
     """Return one report for each bridge that was crossed, in the order of the site files.
 
     Of a crossing in several files the newest result counts. The numbers of a bridge are those of
     the state with the newest crossing; if other files have good crossings of its realm that are not
     in it, all are fused. `baseline` is a results file with which to compare; otherwise the one that
-    the site file names, whose folder is `beside` (default: that of the results). Raise InputError
-    if a baseline does not fit, or results do not fit their site file.
+    the site file names, whose folder is `beside` (default: that of the results). `validations` is
+    the folder of validation records. Raise InputError if a baseline does not fit, or results do not
+    fit their site file.
     """
     for path, results, site in files:
         _check(path, results, site)
@@ -95,7 +99,7 @@ def bridge_reports(
         for bridge in site.bridges
         if any(crossing.bridge == bridge.id for crossing in results.crossings)
     )
-    return [_report(name, files, baseline, beside, language) for name in names]
+    return [_report(name, files, baseline, beside, language, validations) for name in names]
 
 
 def _check(path: Path, results: Results, site: Site) -> None:
@@ -119,6 +123,7 @@ def _report(
     baseline: Path | None,
     beside: Path | None,
     language: Language,
+    validations: Path,
 ) -> BridgeReport:
     about = [f for f in files if any(c.bridge == name for c in f[1].crossings)]
     about.sort(key=lambda file: file[1].created)
@@ -138,6 +143,9 @@ def _report(
     view = view_of_bridge(bridge, merged, stored)
     used = tuple(crossing for crossing in crossings if crossing.crossing_id in view.used)
     combined = None if before is not None else combined_surveys(_survey_files(name, about), used)
+    pairs = pairs_without_validation(used)
+    notes = tuple(validation_notes(validations, site, pairs, language))
+    basis = CautionBasis(bridge, view, used, before, combined, notes)
     return BridgeReport(
         bridge,
         view,
@@ -149,7 +157,7 @@ def _report(
         before,
         _finding(view, crossings, stored, language),
         _quality(view, crossings, language),
-        tuple(cautions(CautionBasis(bridge, view, used, before, combined), language)),
+        tuple(cautions(basis, language)),
     )
 
 

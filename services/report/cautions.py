@@ -42,12 +42,15 @@ class CautionBasis(NamedTuple):
     """Crossings behind the numbers, in order of time."""
     before: Before | None
     combined: CombinedSurveys | None
+    validation: tuple[str, ...] = ()
+    """Sentences on pairs of truck and bridge without a passed site validation."""
 
 
 def cautions(measured: CautionBasis, language: Language) -> Iterator[str]:
     """Yield the cautions on a finding, the most important one first."""
     if measured.view.estimate is None:
         return
+    yield from measured.validation
     yield from _same_crossings(measured, language)
     comparison = measured.view.comparison
     if comparison is not None:

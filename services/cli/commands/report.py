@@ -8,12 +8,14 @@ from services.cli.parser import Subcommand
 from services.common.kinds import HTML, PDF
 from services.common.language import LANGUAGES
 from services.common.options import (
+    CERTIFICATES,
     file_option,
     flag,
     opt,
     output_option,
     positional,
     site_option,
+    validations_option,
 )
 
 if TYPE_CHECKING:
@@ -42,6 +44,9 @@ class ReportOptions:
         "earlier results, shown next to these with the change (default: the site file's)",
         "BEFORE.json",
     )
+    validations: Path | None = validations_option(
+        f"folder of validation records (default: {CERTIFICATES})"
+    )
     language: str = opt("report language (default: en)", default="en", choices=tuple(LANGUAGES))
     history: Path | None = file_option(
         "add a page with each bridge over time, from this history", "DIR"
@@ -57,6 +62,7 @@ def _report(asked: ReportOptions) -> int:
     from services.common.files import check_writable, write_atomically
     from services.common.language import language_of
     from services.common.progress import steps_bar
+    from services.history.validation_files import check_validations
     from services.ledger.site_of_results import site_of_results
     from services.report.bridge import bridge_reports
     from services.report.histories import with_histories
@@ -67,6 +73,8 @@ def _report(asked: ReportOptions) -> int:
     if output.suffix not in (".html", ".htm"):
         raise InputError(f"{output}: the name of an HTML file (.html) is expected")
     pdf = output.with_suffix(".pdf")
+    check_validations(asked.validations)
+    records = asked.validations or CERTIFICATES
     check_writable(output)
     if asked.pdf:
         check_writable(pdf, kinds=(PDF,))
@@ -76,7 +84,7 @@ def _report(asked: ReportOptions) -> int:
         files.append((path, results, site_of_results(path, results, asked.site)))
     beside = None if asked.site is None else asked.site.parent
     language = language_of(asked.language)
-    reports = bridge_reports(files, asked.baseline, beside, language)
+    reports = bridge_reports(files, asked.baseline, beside, language, records)
     if asked.history is not None:
         reports = with_histories(reports, asked.history, asked.period, print, language)
     with steps_bar(f"drawing {output}") as progress:

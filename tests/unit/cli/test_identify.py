@@ -25,7 +25,7 @@ from schemas.site_file import parse_site, site_hash, site_toml
 from schemas.topics import Message
 from schemas.validation_records import VehicleBridgePair, pair_hash
 from services.cli import main as cli
-from services.cli.identify import identify_command
+from services.cli.identify import _print_validation, identify_command
 from services.cli.settings import IdentifyOptions
 from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_lat_lon
@@ -45,6 +45,7 @@ from services.simulation.drive import (
 )
 from tests.builders.certificates import certificate
 from tests.identifications import identify_recordings
+from tests.unit.viewer.found import results_of, some_crossing
 
 SOUND_NM2 = 1.56e10
 LEAST_SQUARES = IdentificationSettings(method="least_squares")
@@ -403,6 +404,23 @@ def test_method_and_seed_reach_the_search(recording: Path) -> None:
     ]
     assert answers[0] == answers[1]
     assert answers[0] != answers[2]
+
+
+def test_bridge_without_site_validation_has_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site = paper_site()
+    found = results_of(site, some_crossing("a"), some_crossing("b", entry=60.0))
+    failed = certificate(site, passed=False)
+    for folder, words in ((tmp_path, "No site validation of"), (tmp_path, "Site validation of")):
+        _print_validation(Console(), found, site, folder)
+        out = capsys.readouterr().out
+        assert out.startswith(f"bridge-1: {words} truck-1 on this bridge")
+        assert out.count("bridge-1:") == 1
+        save(folder, failed)
+    save(tmp_path, certificate(site))
+    _print_validation(Console(), found, site, tmp_path)
+    assert capsys.readouterr().out == ""
 
 
 def test_a_certificate_that_there_is_is_named(

@@ -15,13 +15,16 @@ from schemas.results import Results, results_json
 from schemas.site import Site
 from services.common.language import LANGUAGES, language_of
 from services.history.bridge_history import BridgeHistory, ElementChange, PeriodComparison
+from services.history.validation_files import save
 from services.history.watch_files import MonitoringState
 from services.report.advice import next_steps
 from services.report.bridge import BridgeReport, bridge_reports
 from services.report.earlier import season_of
 from services.report.histories import with_history
+from services.report.page import page
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.drawing import STYLE
+from tests.builders.certificates import certificate
 from tests.unit.history.test_bridge_history import alarm
 from tests.unit.history.test_history_store import BEGIN_S
 from tests.unit.report.test_report import KNOWN, Seen, fused, reported
@@ -270,6 +273,35 @@ def with_ends(results: Results, sprung: float, giving: float) -> Results:
         one["derived"]["probability_sprung"] = {"start": sprung, "end": 0.1}
         one["derived"]["probability_giving"] = {"start": 0.1, "end": giving}
     return Results.model_validate(content)
+
+
+@pytest.mark.parametrize("code", ["en", "de"])
+def test_missing_or_failed_site_validation_is_named_once(
+    site: Site, tmp_path: Path, code: str
+) -> None:
+    words = language_of(code)
+    two = [some_crossing("a"), some_crossing("b", entry=60.0)]
+    found = results_of(site, *two, used="b")
+
+    def cautions_with(results: Results) -> str:
+        files = [(Path("x.json"), results, site)]
+        (report,) = bridge_reports(files, None, language=words, validations=tmp_path)
+        first = first_page(Seen(page([report], language=words)))
+        assert all(caution in first for caution in report.cautions)
+        return " ".join(report.cautions)
+
+    untried = words.text("caution.unvalidated", trucks="truck-1")
+    assert cautions_with(found).count(untried) == 1
+    failed = certificate(site, passed=False)
+    save(tmp_path, failed)
+    text = cautions_with(found)
+    assert untried not in text
+    values = {"truck": "truck-1", "good": 1, "crossings": 1, "covered": 2, "intervals": 2}
+    assert text.startswith(words.text("caution.validation_failed", **values))
+    named = [one | {"certificate": failed.hash} for one in two]
+    assert "driveby validate" not in cautions_with(results_of(site, *named, used="b"))
+    save(tmp_path, certificate(site))
+    assert words.text("caution.validation_failed", **values) not in cautions_with(found)
 
 
 def test_likely_restraint_is_on_the_first_page_unless_declared(site: Site) -> None:

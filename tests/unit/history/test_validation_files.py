@@ -1,0 +1,67 @@
+"""Sentences on results that no passed site validation covers."""
+
+from pathlib import Path
+
+import pytest
+
+from schemas.site import Site
+from schemas.validation_records import VehicleBridgePair
+from services.common.language import language_of
+from services.history.validation_files import pairs_without_validation, save, validation_notes
+from tests.builders.certificates import certificate
+from tests.unit.viewer.found import results_of, some_crossing
+
+PAIR = VehicleBridgePair("truck-1", "bridge-1")
+UNTRIED = (
+    "No site validation of truck-1 on this bridge: whether the intervals contain the truth has not "
+    "been tried. Run driveby validate --site site.toml."
+)
+
+
+def test_pairs_are_those_of_intervals_without_a_record(site: Site) -> None:
+    some = [some_crossing(name) for name in "ab"]
+    assert pairs_without_validation(results_of(site, *some).crossings) == [PAIR]
+    named = some_crossing("c") | {"certificate": "0" * 16}
+    rejected = some_crossing("d", verdict="rejected", reasons=("speed_too_low",))
+    other = some_crossing("e") | {"method": "least_squares"}
+    assert pairs_without_validation(results_of(site, named, rejected, other).crossings) == []
+
+
+def test_untried_pairs_share_a_sentence(site: Site, tmp_path: Path) -> None:
+    assert list(validation_notes(tmp_path / "none", site, [PAIR])) == [UNTRIED]
+    assert list(validation_notes(tmp_path, site, [])) == []
+    both = [PAIR, VehicleBridgePair("truck-2", "bridge-1")]  # the second is not of the site
+    (line,) = validation_notes(tmp_path, site, both)
+    assert "of truck-1 and truck-2 on this bridge" in line
+
+
+def test_record_of_the_pair_decides(site: Site, tmp_path: Path) -> None:
+    figures = certificate(site).figures
+    failed = figures.model_copy(
+        update={"crossings": 12, "good": 12, "intervals": 60, "covered": 49}
+    )
+    save(tmp_path, certificate(site, passed=False, figures=failed.model_dump()))
+    (line,) = validation_notes(tmp_path, site, [PAIR])
+    assert line == (
+        "Site validation of truck-1 on this bridge FAILED: 12 of 12 simulated crossings were good, "
+        "49 of 60 intervals contained the truth. Do not rely on the intervals."
+    )
+    (german,) = validation_notes(tmp_path, site, [PAIR], language_of("de"))
+    assert "NICHT bestanden: 12 von 12 simulierten Überfahrten" in german
+    save(tmp_path, certificate(site))
+    assert list(validation_notes(tmp_path, site, [PAIR])) == []
+
+
+def test_record_of_another_truck_counts_for_nothing(site: Site, tmp_path: Path) -> None:
+    save(tmp_path, certificate(site))
+    heavier = site.vehicles[0].model_copy(update={"total_mass_kg": 9999.0})
+    changed = site.model_copy(update={"vehicles": (heavier,)})
+    assert list(validation_notes(tmp_path, changed, [PAIR])) == [UNTRIED]
+
+
+def test_unreadable_record_is_a_warning(
+    site: Site, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    save(tmp_path, certificate(site)).write_text("{")
+    assert list(validation_notes(tmp_path, site, [PAIR])) == [UNTRIED]
+    assert len(caplog.records) == 1
