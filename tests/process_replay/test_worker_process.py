@@ -349,11 +349,11 @@ class Restartable(NamedTuple):
 def restartable(start: Start, endpoint: str, site: Path, tmp_path: Path) -> Restartable:
     folder = tmp_path / "of_runs"
 
-    def begin(method: str = "least_squares") -> subprocess.Popen[str]:
+    def begin(method: str = "least_squares", realm: str = REALM) -> subprocess.Popen[str]:
         return start(
             "services.worker",
             endpoint=endpoint,
-            realm=REALM,
+            realm=realm,
             site=site,
             folder=folder,
             file=None,
@@ -474,6 +474,38 @@ def test_killed_in_the_middle_of_an_identification(
         stop(process)
     check_once(published, restartable, tmp_path / "recorded.mcap")
     assert len(restartable.paths()) == 2
+
+
+def test_killed_worker_of_a_replay_needs_the_replay_again(
+    bus: zenoh.Session, restartable: Restartable, site: Path, project: Path
+) -> None:
+    """Its next run reads no recording and no earlier run: a crossing of an ended replay is lost."""
+    sample, realm = project / "recordings" / "sample" / "crossing.mcap", "replay-drive"
+    text = read_site(sample)
+    assert text is not None
+    site.write_text(text)
+    with (
+        Subscription(bus, selector(realm, "bridge")) as results,
+        Subscription(bus, selector(realm, "service", "progress")) as progress,
+        Subscription(bus, selector(realm, "service", "health")) as health,
+    ):
+        process = restartable.begin("pre", realm)
+        up_to(health, "health")
+        replay = Publisher(bus, realm)
+        publish(replay, list(read_messages(sample)))
+        up_to(progress, "progress")
+        replay.close()
+        kill(process)
+        assert [one.key().stream for one in several(results, 3)] == ["crossing"] * 3
+        after(health, 0.5)
+        process = restartable.begin("pre", realm)
+        up_to(health, "health")
+        assert after(results, 4.0) == []  # longer than after a truck has left
+        again = Publisher(bus, realm)
+        publish(again, list(read_messages(sample)))
+        up_to(results, "estimate")
+        again.close()
+        stop(process)
 
 
 def test_a_second_signal_ends_it_in_the_middle_of_an_identification(
