@@ -48,7 +48,7 @@ class HistoryOptions:
         "period of fusion (default: month)", default="month", choices=("day", "week", "month")
     )
     site: Path | None = site_option(
-        "site file whose baseline of the bridge is 100 % in figures (default: the first period)"
+        "site file with the baseline that figures relate EI to (default: the first period)"
     )
     temperature: Path | None = file_option(
         "with add: CSV file of temperatures (time_s,temperature_deg_c[,bridge])", "T.csv"
