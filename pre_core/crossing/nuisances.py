@@ -2,9 +2,9 @@
 
 They are determined by residuals so exact that no weighted draw of all coordinates would ever be
 likely; given the bridge they are normal. So residuals are evaluated with nuisances that follow the
-bridge, and projected on what no nuisance explains. They follow it linearly, then by one step of
-Gauss-Newton for each bridge: without it, a bridge metres from the optimum's offset would be free to
-move the truck to where its residuals are not linear, and fit better than any.
+bridge, and projected on what no nuisance explains. They follow it linearly, and on demand
+by one step of Gauss-Newton for each bridge: without it, a bridge metres from the optimum's offset
+would be free to move the truck to where its residuals are not linear, and fit better than any.
 
 The vibration before the crossing is a wave of the bridge's own frequency, which moves with the
 bridge: removed at the frequency of the optimum it would leave, or take, a wave in the residuals of
@@ -134,10 +134,10 @@ def unexplained(of: Nuisances, columns: FloatArray) -> FloatArray:
     return np.asarray(columns - of.basis @ (of.basis.T @ columns))
 
 
-def integrated_residuals(of: Nuisances, drawn: FloatArray) -> FloatArray:
+def integrated_residuals(of: Nuisances, drawn: FloatArray, *, has_step: bool) -> FloatArray:
     """Return residuals (m + r, k) at points (k, n + 1), with nuisances integrated out.
 
-    Each point takes two evaluations.
+    Each point takes an evaluation, and another one if it `has_step` of its own.
     """
     where, parts = posterior.layout(of.problem), of.parts
     moves = drawn - of.y[of.kept]
@@ -146,7 +146,8 @@ def integrated_residuals(of: Nuisances, drawn: FloatArray) -> FloatArray:
     points[:, where.trajectory] += moves[:, -1:]
     points[:, of.own] += moves @ of.of_own.T
     points[:, parts.linear] += moves @ of.of_linear.T
-    points[:, of.own] += (of.step @ _residuals(of, points)).T
+    if has_step:
+        points[:, of.own] += (of.step @ _residuals(of, points)).T
     return unexplained(of, _residuals(of, points))
 
 

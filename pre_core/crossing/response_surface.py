@@ -6,6 +6,7 @@ at the optimum alone miss what a bridge with restrained ends does to a crossing 
 has none. All other coordinates are integrated out (`nuisances`).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -19,11 +20,14 @@ from pre_core.crossing.nuisances import (
     with_mixture,
 )
 
-POINTS = 1920
-"""Number of points to which a surface is fitted, fourteen for each of its coefficients. With a
-third as many the remainder of third order enters the slopes as if it were knowledge of the bridge:
-fused intervals were up to 1.6 times too narrow, and other points moved them by twice their width.
+POINTS, POINTS_OF_DRAWS = 1920, 640
+"""Numbers of points to which a surface is fitted: one that is fused, fourteen for each of its
+coefficients, and one of a single crossing. With a third as many the remainder of third order enters
+the slopes as if it were knowledge of the bridge: fused intervals were up to 1.6 times too narrow,
+and other points moved them by twice their width.
 """
+_TOGETHER = 160
+"""Number of points evaluated together: their residuals take some ten megabytes."""
 _LEAST_SIZE = 1e-9
 _RIDGE = 1e-2
 """Weight against slopes and products that the points do not separate."""
@@ -66,18 +70,23 @@ def _products(u: FloatArray) -> FloatArray:
     return np.asarray(u[:, first] * u[:, second])
 
 
-def response_surface(of: Nuisances, jacobian: FloatArray, drawn: FloatArray) -> ResponseSurface:
+def response_surface(
+    of: Nuisances, jacobian: FloatArray, drawn: FloatArray, *, has_step: bool = False
+) -> ResponseSurface:
     """Return the surface of a crossing fitted at points of its curved coordinates and offset.
 
     `jacobian` (rows, f) is that of its residuals at the optimum, in the coordinates y. `drawn`
-    (POINTS, n + 1) are the points.
+    (k, n + 1) are the points, whose nuisances may have a step of their own.
     """
     parts, r = of.parts, of.mixture_size
     linear = unexplained(of, with_mixture(jacobian[np.ix_(parts.rows, parts.linear)], r))
     waves = unexplained(of, with_mixture(parts.waves, r))
     # Zero is what the site file excludes.
     centre, size = drawn.mean(axis=0), np.maximum(drawn.std(axis=0), _LEAST_SIZE)
-    fitted = _fit_parabolas((drawn - centre) / size, integrated_residuals(of, drawn))
+    fitted = _fit_parabolas(
+        (drawn - centre) / size,
+        lambda some: integrated_residuals(of, drawn[some], has_step=has_step),
+    )
     # The residuals' squares are all that counts, so that a rotation makes them few.
     (few,) = qr(np.hstack([fitted, linear, waves]), mode="r")
     n = of.kept.size
@@ -93,13 +102,20 @@ def response_surface(of: Nuisances, jacobian: FloatArray, drawn: FloatArray) -> 
         of.y[parts.linear] + of.of_linear @ (centre - of.y[of.kept]),
         of.of_linear * size,
         waves,
-        of.evaluations + 2 * drawn.shape[0],
+        of.evaluations + (2 if has_step else 1) * drawn.shape[0],
     )
 
 
-def _fit_parabolas(u: FloatArray, values: FloatArray) -> FloatArray:
-    """Return constant, slopes and products (m, 1 + n + pairs) of values (m, k) at u (k, n)."""
+def _fit_parabolas(u: FloatArray, values_at: Callable[[slice], FloatArray]) -> FloatArray:
+    """Return constant, slopes and products (m, 1 + n + pairs) of values at points u (k, n).
+
+    `values_at` returns those (m, …) of some points, so that not all are in memory.
+    """
     design = np.column_stack([np.ones(u.shape[0]), u, _products(u)])
     normal = design.T @ design
     normal[1:, 1:] += _RIDGE * np.eye(normal.shape[0] - 1)
-    return np.asarray(cho_solve(cho_factor(normal), design.T @ values.T).T)
+    image: FloatArray | float = 0.0
+    for first in range(0, u.shape[0], _TOGETHER):
+        some = slice(first, first + _TOGETHER)
+        image = image + design[some].T @ values_at(some).T
+    return np.asarray(cho_solve(cho_factor(normal), image).T)

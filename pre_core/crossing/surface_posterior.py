@@ -28,6 +28,7 @@ from pre_core.crossing.nuisances import (
 )
 from pre_core.crossing.response_surface import (
     POINTS,
+    POINTS_OF_DRAWS,
     ResponseSurface,
     residuals_of,
     response_surface,
@@ -41,12 +42,10 @@ _WIDENED = 2.0
 seldom outside, and is where many crossings are linearised in fusion."""
 _FIRST_POINTS = 320
 """Number of points of the first surface, which only says where the second is wanted."""
-_SHARE_OF_POINTS = 3
-"""Weighted draws for each point, which is then rarely drawn twice."""
 
 
 class SurfacePosterior(NamedTuple):
-    """The surface of a crossing and the points to which it was fitted."""
+    """The surface of a crossing, and points of its widened posterior."""
 
     curved: NDArray[np.int64]
     """Indices (n,) in y of the bridge's coordinates and of others that must not be negative."""
@@ -75,7 +74,7 @@ def nuisances_on(found: Optimum, points: FloatArray) -> Nuisances:
 
 def exact_squares(of: Nuisances, y: FloatArray) -> FloatArray:
     """Return sums of squares (k,) of the residuals themselves at points y (k, n + 1)."""
-    return np.asarray(np.sum(integrated_residuals(of, y) ** 2, axis=0))
+    return np.asarray(np.sum(integrated_residuals(of, y, has_step=True) ** 2, axis=0))
 
 
 def curved_coordinates(found: Optimum) -> NDArray[np.int64]:
@@ -104,13 +103,13 @@ def surface_posterior(found: Optimum, inflation: float, seed: int) -> SurfacePos
 
     widened = _WIDENED * inflation
     first = fitted(_points_of_normal(found, _FIRST_POINTS, widened, seed))
-    wanted = _SHARE_OF_POINTS * POINTS
-    wide = draw_curved(found, first.squares, wanted, seed, widened, may_be_absent=False)
-    if not is_enough(wide.worth, wanted):
-        return first
+    wide = draw_curved(found, first.squares, POINTS, seed, widened, may_be_absent=False)
+    if not is_enough(wide.worth, POINTS):
+        return first._replace(points=_points_of_normal(found, POINTS, widened, seed))
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 23,)))
-    second = fitted(wide.y[importance.systematic_resample(wide.worth.weight, POINTS, rng)])
-    return second._replace(evaluations=first.evaluations + second.evaluations)
+    points = wide.y[importance.systematic_resample(wide.worth.weight, POINTS, rng)]
+    second = fitted(points[:POINTS_OF_DRAWS])
+    return second._replace(points=points, evaluations=first.evaluations + second.evaluations)
 
 
 def _points_of_normal(found: Optimum, count: int, inflation: float, seed: int) -> FloatArray:
