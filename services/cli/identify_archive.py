@@ -1,6 +1,7 @@
 """The command `driveby identify --into DIR`: an archive of recordings, stored as computed."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from itertools import chain
 from pathlib import Path
@@ -83,12 +84,15 @@ def archive_command(
     )
     kept = ResultStore(into)
     crossings: list[CrossingResult] = []
-    unvalidated: set[VehicleBridgePair] = set()
+    unvalidated: defaultdict[str, set[VehicleBridgePair]] = defaultdict(set)
 
     def take(crossing: CrossingResult) -> None:
-        unvalidated.update(pairs_without_validation([crossing]))
+        unvalidated[crossing.bridge].update(pairs_without_validation([crossing]))
         if json_path is not None:
             crossings.append(crossing)
+
+    def notes_of(bridge: str) -> Iterator[str]:
+        return validation_notes(folder, known, sorted(unvalidated[bridge]))
 
     with executing as execution, progress_bar(console) as bar:
         task = bar.add_task("crossings", total=None)
@@ -105,11 +109,7 @@ def archive_command(
     if json_path is not None:
         crossings.sort(key=lambda one: (one.entry_time, one.crossing_id))
         _write(json_path, header, with_common_shares(crossings, found.bridges), found)
-    notes = {
-        name: list(validation_notes(folder, known, sorted(p for p in unvalidated if p[1] == name)))
-        for name in found.bridges
-    }
-    return _print_summary(found, notes, [*problems, *found.problems], known, into, console)
+    return _print_summary(found, notes_of, [*problems, *found.problems], known, into, console)
 
 
 def _check(options: IdentifyOptions, into: Path) -> None:
@@ -183,7 +183,7 @@ def _write(
 
 def _print_summary(
     found: ArchiveResult,
-    notes: Mapping[str, list[str]],
+    notes_of: Callable[[str], Iterable[str]],
     problems: Sequence[str],
     site: Site,
     into: Path,
@@ -197,7 +197,7 @@ def _print_summary(
             write(f"… and {count_of(len(found.bridges) - number, 'more bridge')}")
             break
         print_bridge(console, site.bridge(name), state)
-        for note in notes[name]:
+        for note in notes_of(name):
             write(note)
         console.print()
     for problem in problems:

@@ -47,10 +47,8 @@ def passed_validations(
     bridges = {bridge.id for bridge in site.bridges}
     found = {}
     for path in sorted(folder.glob("*.json")):
-        try:
-            one = load_validation(path)
-        except InputError as error:
-            _log.warning("%s", error)
+        one = _readable(path)
+        if one is None:
             continue
         is_ours = one.vehicle in vehicles and one.bridge in bridges
         if is_ours and one.passed and one.hash == pair_hash(site, one.pair, settings):
@@ -101,8 +99,11 @@ def _record_of(folder: Path, site: Site, pair: VehicleBridgePair) -> ValidationR
         path = validation_path(folder, pair_hash(site, pair, IdentificationSettings()))
     except KeyError:  # the site file is another one
         return None
-    if not path.exists():
-        return None
+    return _readable(path) if path.exists() else None
+
+
+def _readable(path: Path) -> ValidationRecord | None:
+    """Return the record of a file; None if it cannot be read, which is a warning."""
     try:
         return load_validation(path)
     except InputError as error:

@@ -47,7 +47,7 @@ def with_history(report: BridgeReport, past: BridgeHistory, language: Language) 
     """Return a report with a history, whose alarms and changes its finding must not contradict."""
     before = report.before
     if before is not None:
-        means = tuple(float(ei) for ei in before.estimate.mean)
+        means = tuple(before.estimate.mean.tolist())
         past = past._replace(baseline=StoredBaseline(before.name, means))
     report = report._replace(past=past)
     finding, cautions = report.finding, list(report.cautions)

@@ -87,8 +87,7 @@ def _elements(drawn: HistoryView, language: Language) -> Html:
     """Return the table of the newest period, and of what it is related to."""
     newest = drawn.points[-1]
     references = [drawn.reference(n) for n in range(len(newest.mean))]
-    name, unit = references[0].name, language.text(drawn.unit)
-    which = "baseline" if references[0].is_baseline else "first"
+    name, which, unit = references[0].name, references[0].kind, language.text(drawn.unit)
     heads = [
         language.text("table.element"),
         language.text(f"history.column.{which}", name=name, unit=unit),

@@ -83,6 +83,11 @@ class HistoryReference(NamedTuple):
     is_baseline: bool
     ei_nm2: float
 
+    @property
+    def kind(self) -> str:
+        """Return the end of the names of its sentences."""
+        return "baseline" if self.is_baseline else "first"
+
     def label(self, language: Language) -> str:
         """Return its name next to an axis."""
         return language.text("history.baseline") if self.is_baseline else self.name
@@ -227,9 +232,8 @@ def _heading(history: HistoryView, language: Language) -> list[tuple[str, str]]:
 def reference_sentence(history: HistoryView, language: Language) -> str:
     """Return what 100 % is; the first element stands for all."""
     reference = history.reference(0)
-    which = "baseline" if reference.is_baseline else "first"
     unit = language.text(history.unit)
-    return language.text(f"history.reference.{which}", name=reference.name, unit=unit)
+    return language.text(f"history.reference.{reference.kind}", name=reference.name, unit=unit)
 
 
 def _short(text: str) -> str:

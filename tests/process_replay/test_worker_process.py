@@ -76,6 +76,16 @@ def drive_on(scenario_6: SimulatedDrive) -> list[Message]:
 
 
 @pytest.fixture
+def sample(project: Path, site: Path) -> list[Message]:
+    """The sample's messages; the worker's site file becomes the sample's."""
+    recording = project / "recordings" / "sample" / "crossing.mcap"
+    text = read_site(recording)
+    assert text is not None
+    site.write_text(text)
+    return list(read_messages(recording))
+
+
+@pytest.fixture
 def bus(start: Start, endpoint: str, tmp_path: Path) -> Iterator[zenoh.Session]:
     """A session of the test, behind the logger's router."""
     start(
@@ -448,21 +458,16 @@ def check_once(published: list[RawSample], restartable: Restartable, recorded: P
 def test_killed_in_the_middle_of_an_identification(
     bus: zenoh.Session,
     restartable: Restartable,
-    site: Path,
-    project: Path,
+    sample: list[Message],
     tmp_path: Path,
 ) -> None:
     """Method pre, which takes seconds; killed as soon as it says how far it is."""
-    sample = project / "recordings" / "sample" / "crossing.mcap"
-    text = read_site(sample)
-    assert text is not None
-    site.write_text(text)
     with (
         Subscription(bus, selector(REALM, "bridge")) as results,
         Subscription(bus, selector(REALM, "service", "progress")) as progress,
     ):
         publisher = Publisher(bus, REALM)
-        publish(publisher, list(read_messages(sample)))
+        publish(publisher, sample)
         process = restartable.begin("pre")
         up_to(progress, "progress")
         kill(process)
@@ -477,13 +482,10 @@ def test_killed_in_the_middle_of_an_identification(
 
 
 def test_killed_worker_of_a_replay_needs_the_replay_again(
-    bus: zenoh.Session, restartable: Restartable, site: Path, project: Path
+    bus: zenoh.Session, restartable: Restartable, sample: list[Message]
 ) -> None:
     """Its next run reads no recording and no earlier run: a crossing of an ended replay is lost."""
-    sample, realm = project / "recordings" / "sample" / "crossing.mcap", "replay-drive"
-    text = read_site(sample)
-    assert text is not None
-    site.write_text(text)
+    realm = "replay-drive"
     with (
         Subscription(bus, selector(realm, "bridge")) as results,
         Subscription(bus, selector(realm, "service", "progress")) as progress,
@@ -492,7 +494,7 @@ def test_killed_worker_of_a_replay_needs_the_replay_again(
         process = restartable.begin("pre", realm)
         up_to(health, "health")
         replay = Publisher(bus, realm)
-        publish(replay, list(read_messages(sample)))
+        publish(replay, sample)
         up_to(progress, "progress")
         replay.close()
         kill(process)
@@ -502,22 +504,18 @@ def test_killed_worker_of_a_replay_needs_the_replay_again(
         up_to(health, "health")
         assert after(results, 4.0) == []  # longer than after a truck has left
         again = Publisher(bus, realm)
-        publish(again, list(read_messages(sample)))
+        publish(again, sample)
         up_to(results, "estimate")
         again.close()
         stop(process)
 
 
 def test_a_second_signal_ends_it_in_the_middle_of_an_identification(
-    bus: zenoh.Session, restartable: Restartable, site: Path, project: Path
+    bus: zenoh.Session, restartable: Restartable, sample: list[Message]
 ) -> None:
-    sample = project / "recordings" / "sample" / "crossing.mcap"
-    text = read_site(sample)
-    assert text is not None
-    site.write_text(text)
     with Subscription(bus, selector(REALM, "service", "progress")) as progress:
         publisher = Publisher(bus, REALM)
-        publish(publisher, list(read_messages(sample)))
+        publish(publisher, sample)
         process = restartable.begin("pre")
         up_to(progress, "progress")
         process.terminate()

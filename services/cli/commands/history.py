@@ -196,17 +196,16 @@ def _baseline(site: Path, bridge: str) -> "StoredBaseline | None":
     """Return the baseline that a site file names for a bridge; None if it names none."""
     from schemas.site_file import load_site
     from services.history.bridge_history import StoredBaseline
-    from services.ledger.baselines import stored_state
+    from services.viewer.baseline import named_baseline
 
     try:
         known = load_site(site).bridge(bridge)
     except KeyError:
         raise InputError(f"{site}: has no bridge {bridge}") from None
-    if known.baseline is None:
+    estimate, name = named_baseline(known, site.parent, required=True)
+    if estimate is None or name is None:
         return None
-    path = site.parent / known.baseline
-    elements = stored_state(path, known).elements.values()
-    return StoredBaseline(path.name, tuple(element.mean for element in elements))
+    return StoredBaseline(name, tuple(estimate.mean.tolist()))
 
 
 def _drawn(options: HistoryOptions, past: "BridgeHistory") -> Iterator[Path]:
