@@ -4,6 +4,7 @@ Draws of a cheap density near the posterior (`surrogate`) are weighted by the po
 that density for the next draws. All batches are weighted as draws of one mixture density.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,13 @@ from pre_core.arrays import FloatArray
 from pre_core.crossing import compliances, posterior, surrogate
 from pre_core.crossing.fit import Optimum, normal_approximation
 from pre_core.crossing.mismatch import has_alike_tyres
-from pre_core.crossing.surface_posterior import complete, draw_curved, surface_posterior
+from pre_core.crossing.surface_posterior import (
+    complete,
+    draw_curved,
+    exact_squares,
+    nuisances_at_optimum,
+    surface_posterior,
+)
 from pre_core.crossing.weighted_draws import (
     MIN_EFFECTIVE_SHARE,
     WeightedDraws,
@@ -30,6 +37,8 @@ _LARGEST_R_HAT = 1.05
 """Convergence limit of R-hat of rigidities and mass."""
 _MAX_RUNS = 14
 """Limit of draws with alike tyres, relative to the requested ones."""
+_LEAST_ESS = 30.0
+"""Effective number of draws below which their quantiles say nothing."""
 _NEGLIGIBLE_ODDS = 0.02
 """Odds below which torsion is omitted from the draws: it changes no interval and costs draws."""
 
@@ -146,28 +155,51 @@ def _resample_to_chains(
 def _mismatch_draws(
     found: Optimum, draws: int, seed: int, inflation: float, report: Report
 ) -> PosteriorDraws:
-    """Return draws with mismatch: of a response surface, or of `compliances`.
+    """Return draws with mismatch: by the residuals where tyres are alike, else by their surface.
 
-    The second are those of alike tyres, and where weighted draws of the surface do not suffice. The
-    residuals are not evaluated again for them: the truck is determined by its own sensors, through
-    residuals so exact that their curvature keeps chains from moving.
+    Residuals of alike tyres show a bridge so sharply that no surface follows them. Where weighted
+    draws do not suffice they are replaced by those of `compliances`, linear in c.
     """
-    points, evaluations = None, 0
-    if not has_alike_tyres(found.problem.mismatch):
-        of = surface_posterior(found, inflation, seed)
-        points, evaluations = of.points, of.evaluations
-        weighted = draw_curved(found, of, draws, seed, inflation, report)
-        if is_enough(weighted.worth, draws):
-            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 24,)))
-            drawn = complete(found, of, weighted.y, inflation, rng)
-            drawn += compliances.MISMATCH_BIAS_SPREAD * np.outer(
-                rng.standard_normal(drawn.shape[0]), compliances.mismatch_bias(found)
-            )
-            of_all = WeightedDraws(drawn, weighted.worth)
-            chains = _resample_to_chains(of_all, _monitored_indices(found.problem), draws, seed)
-            return chains._replace(evaluations=evaluations, points=points)
-    chains = _compliance_draws(found, draws, seed, inflation)
-    return chains._replace(evaluations=evaluations, points=points)
+    if has_alike_tyres(found.problem.mismatch):
+        return _alike_tyres_draws(found, draws, seed, inflation, report)
+    of = surface_posterior(found, inflation, seed)
+    weighted = draw_curved(found, of.squares, draws, seed, inflation, report)
+    if is_enough(weighted.worth, draws):
+        chains = _completed_to_chains(found, weighted, draws, seed, inflation)
+    else:
+        chains = _compliance_draws(found, draws, seed, inflation)
+    return chains._replace(evaluations=of.evaluations, points=of.points)
+
+
+def _alike_tyres_draws(
+    found: Optimum, draws: int, seed: int, inflation: float, report: Report
+) -> PosteriorDraws:
+    """Return draws weighted by the residuals, also where they have not converged.
+
+    The others, linear in c, had errors of six standard deviations where those did not converge.
+    """
+    nuisances = nuisances_at_optimum(found, inflation, seed)
+    squares = partial(exact_squares, nuisances)
+    weighted = draw_curved(found, squares, draws, seed, inflation, report)
+    if weighted.worth.ess < _LEAST_ESS:
+        chains = _compliance_draws(found, draws, seed, inflation)
+        chains = chains._replace(ending=Termination.STEPS_EXHAUSTED)
+    else:
+        chains = _completed_to_chains(found, weighted, draws, seed, inflation)
+    return chains._replace(evaluations=nuisances.evaluations + 2 * weighted.y.shape[0])
+
+
+def _completed_to_chains(
+    found: Optimum, weighted: WeightedDraws, draws: int, seed: int, inflation: float
+) -> PosteriorDraws:
+    """Return weighted draws (k, n + 1) of a few coordinates with all others, in chains."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 24,)))
+    drawn = complete(found, weighted.y, inflation, rng)
+    drawn += compliances.MISMATCH_BIAS_SPREAD * np.outer(
+        rng.standard_normal(drawn.shape[0]), compliances.mismatch_bias(found)
+    )
+    of_all = WeightedDraws(drawn, weighted.worth)
+    return _resample_to_chains(of_all, _monitored_indices(found.problem), draws, seed)
 
 
 def _compliance_draws(found: Optimum, draws: int, seed: int, inflation: float) -> PosteriorDraws:

@@ -1,13 +1,14 @@
-"""Posterior of a crossing with profile mismatch, on a response surface of its residuals.
+"""Posterior of a crossing with profile mismatch, in the few coordinates that it hardly determines.
 
-Where the axles' tyres differ, elements, supports and offset are determined so poorly that their
-posterior is neither normal nor near the optimum. Truck and trajectory are determined by residuals
-so exact that no weighted draw of all coordinates would ever be likely; given the others they are
-normal. So they are integrated out (`response_surface`), and the few others are drawn from the
-surface. It is fitted twice: at points of the normal about the optimum, linear in c
-(`compliances`), and at points of the posterior on that first surface, both widened.
+Elements, supports and offset are determined so poorly that their posterior is neither normal nor
+near the optimum. Truck and trajectory follow them (`nuisances`) and are integrated out, so that
+the few are drawn with weights: by the residuals themselves where the axles' tyres are alike, and
+else from a surface of them (`response_surface`). That surface is fitted twice: at points of the
+normal about the optimum, linear in c (`compliances`), and at points of the posterior on that first
+surface, both widened.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -18,11 +19,17 @@ from pre_core.arrays import FloatArray
 from pre_core.crossing import compliances, posterior, surrogate
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.mismatch import has_alike_tyres
+from pre_core.crossing.nuisances import (
+    Nuisances,
+    ResidualParts,
+    integrated_residuals,
+    nuisances_of,
+    place_of_offset,
+)
 from pre_core.crossing.response_surface import (
     POINTS,
+    POINTS_OF_DRAWS,
     ResponseSurface,
-    SurfaceParts,
-    place_of_offset,
     residuals_of,
     response_surface,
 )
@@ -35,18 +42,39 @@ _WIDENED = 2.0
 seldom outside, and is where many crossings are linearised in fusion."""
 _FIRST_POINTS = 320
 """Number of points of the first surface, which only says where the second is wanted."""
-_SHARE_OF_POINTS = 3
-"""Weighted draws for each point, which is then rarely drawn twice."""
 
 
 class SurfacePosterior(NamedTuple):
-    """The surface of a crossing and the points to which it was fitted."""
+    """The surface of a crossing, and points of its widened posterior."""
 
     curved: NDArray[np.int64]
     """Indices (n,) in y of the bridge's coordinates and of others that must not be negative."""
     surface: ResponseSurface
     points: FloatArray  # (k, n + 1), the offset last
     evaluations: int
+
+    def squares(self, y: FloatArray) -> FloatArray:
+        """Return sums of squares (k,) of the residuals at points y (k, n + 1)."""
+        return np.asarray(np.sum(residuals_of(self.surface, y) ** 2, axis=1))
+
+
+def nuisances_at_optimum(found: Optimum, inflation: float, seed: int) -> Nuisances:
+    """Return a crossing's nuisances, with the mixture of bridges of the normal at its optimum."""
+    return nuisances_on(found, _points_of_normal(found, _FIRST_POINTS, inflation, seed))
+
+
+def nuisances_on(found: Optimum, points: FloatArray) -> Nuisances:
+    """Return a crossing's nuisances, with the mixture of bridges of points (k, n + 1)."""
+    problem, curved = found.problem, curved_coordinates(found)
+    rows = compliances.without_priors(problem, found.state.residual.size, curved)
+    none = np.zeros((rows.size, 0))
+    parts = ResidualParts(curved, np.zeros(0, dtype=np.int64), rows, none, np.zeros((0, 0)))
+    return nuisances_of(found, problem, found.state.jacobian, parts, points)
+
+
+def exact_squares(of: Nuisances, y: FloatArray) -> FloatArray:
+    """Return sums of squares (k,) of the residuals themselves at points y (k, n + 1)."""
+    return np.asarray(np.sum(integrated_residuals(of, y, has_step=True) ** 2, axis=0))
 
 
 def curved_coordinates(found: Optimum) -> NDArray[np.int64]:
@@ -67,24 +95,21 @@ def surface_points(found: Optimum, inflation: float, seed: int) -> FloatArray:
 
 def surface_posterior(found: Optimum, inflation: float, seed: int) -> SurfacePosterior:
     """Return the surface of a crossing, for noise `inflation` times the declared one."""
-    problem, curved = found.problem, curved_coordinates(found)
-    rows = compliances.without_priors(problem, found.state.residual.size, curved)
-    none = np.zeros((rows.size, 0))
-    parts = SurfaceParts(curved, np.zeros(0, dtype=np.int64), rows, none, np.zeros((0, 0)))
+    curved = curved_coordinates(found)
 
     def fitted(points: FloatArray) -> SurfacePosterior:
-        surface = response_surface(found, problem, found.state.jacobian, parts, points)
+        surface = response_surface(nuisances_on(found, points), found.state.jacobian, points)
         return SurfacePosterior(curved, surface, points, surface.evaluations)
 
     widened = _WIDENED * inflation
     first = fitted(_points_of_normal(found, _FIRST_POINTS, widened, seed))
-    wanted = _SHARE_OF_POINTS * POINTS
-    wide = draw_curved(found, first, wanted, seed, widened, may_be_absent=False)
-    if not is_enough(wide.worth, wanted):
-        return first
+    wide = draw_curved(found, first.squares, POINTS, seed, widened, may_be_absent=False)
+    if not is_enough(wide.worth, POINTS):
+        return first._replace(points=_points_of_normal(found, POINTS, widened, seed))
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 23,)))
-    second = fitted(wide.y[importance.systematic_resample(wide.worth.weight, POINTS, rng)])
-    return second._replace(evaluations=first.evaluations + second.evaluations)
+    points = wide.y[importance.systematic_resample(wide.worth.weight, POINTS, rng)]
+    second = fitted(points[:POINTS_OF_DRAWS])
+    return second._replace(points=points, evaluations=first.evaluations + second.evaluations)
 
 
 def _points_of_normal(found: Optimum, count: int, inflation: float, seed: int) -> FloatArray:
@@ -104,7 +129,7 @@ def _never_absent(log_odds: FloatArray) -> FloatArray:
 
 def draw_curved(
     found: Optimum,
-    of: SurfacePosterior,
+    squares: Callable[[FloatArray], FloatArray],
     draws: int,
     seed: int,
     inflation: float,
@@ -114,16 +139,16 @@ def draw_curved(
 ) -> WeightedDraws:
     """Return weighted draws (k, n + 1) of the curved coordinates and the offset.
 
-    Unless they `may_be_absent`, springs and bearings are present in all.
+    `squares` returns the sums of squares (k,) of the residuals there, without the priors of the
+    curved coordinates. Unless they `may_be_absent`, springs and bearings are present in all.
     """
-    problem = found.problem
-    kept = np.append(of.curved, place_of_offset(problem))
-    centres = np.pad(problem.noise_slope, (0, found.state.y.size))[of.curved]
+    problem, curved = found.problem, curved_coordinates(found)
+    kept = np.append(curved, place_of_offset(problem))
+    centres = np.pad(problem.noise_slope, (0, found.state.y.size))[curved]
 
     def target(y: FloatArray) -> FloatArray:
-        squares = np.sum(residuals_of(of.surface, y) ** 2, axis=1)
-        squares += np.sum((y[:, :-1] - centres) ** 2, axis=1)
-        return np.asarray(-0.5 / inflation**2 * squares)
+        of_priors = np.sum((y[:, :-1] - centres) ** 2, axis=1)
+        return np.asarray(-0.5 / inflation**2 * (squares(y) + of_priors))
 
     full = surrogate.coordinates(found, inflation)
     coordinates = surrogate.restricted(full, kept)
@@ -136,14 +161,13 @@ def draw_curved(
 
 def complete(
     found: Optimum,
-    of: SurfacePosterior,
     drawn: FloatArray,
     inflation: float,
     rng: np.random.Generator,
 ) -> FloatArray:
     """Return y (k, f) with the others drawn given the curved coordinates and offset (k, n + 1)."""
     y, jacobian = found.state.y, found.state.jacobian
-    kept = np.append(of.curved, place_of_offset(found.problem))
+    kept = np.append(curved_coordinates(found), place_of_offset(found.problem))
     others = np.setdiff1d(np.arange(y.size), kept)
     root = cholesky(jacobian[:, others].T @ jacobian[:, others])
 

@@ -32,8 +32,9 @@ from pre_core.crossing.compliances import (
 )
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.mismatch import long_wave_power
+from pre_core.crossing.nuisances import ResidualParts, nuisances_of
 from pre_core.crossing.preparation import replace_mismatch
-from pre_core.crossing.response_surface import SurfaceParts, response_surface
+from pre_core.crossing.response_surface import response_surface
 from pre_core.crossing.surface_posterior import curved_coordinates, surface_points
 from pre_core.fusion.curvature import CurvatureTerms
 from pre_core.fusion.curvature import linearise_with_curvature as straightened_about
@@ -109,12 +110,12 @@ def likelihood(
     bends, others = None, state.y.size - kept.size
     if differs and with_bends:
         prior = np.asarray(np.linalg.inv(covariance_of_all(mismatch, grid)))
-        parts = SurfaceParts(bridge, truck, rows, waves, prior)
-        if points is None:
-            points = surface_points(found, 1.0, _SEED)
+        parts = ResidualParts(bridge, truck, rows, waves, prior)
+        given = surface_points(found, 1.0, _SEED) if points is None else points
         curved = curved_coordinates(found)
-        among = np.append(np.searchsorted(curved, bridge), curved.size)
-        surface = response_surface(found, problem, state.jacobian, parts, points[:, among])
+        given = given[:, np.append(np.searchsorted(curved, bridge), curved.size)]
+        of = nuisances_of(found, problem, state.jacobian, parts, given)
+        surface = response_surface(of, state.jacobian, given, has_step=True)
         bends, linearised = of_surface(surface, posterior.rigidity_spread(problem.priors))
         others = 0
     else:

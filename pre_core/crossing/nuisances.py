@@ -1,0 +1,189 @@
+"""Residuals of a crossing with its nuisances integrated out: truck, trajectory, sensors.
+
+They are determined by residuals so exact that no weighted draw of all coordinates would ever be
+likely; given the bridge they are normal. So residuals are evaluated with nuisances that follow the
+bridge, and projected on what no nuisance explains. They follow it linearly, and on demand
+by one step of Gauss-Newton for each bridge: without it, a bridge metres from the optimum's offset
+would be free to move the truck to where its residuals are not linear, and fit better than any.
+
+The vibration before the crossing is a wave of the bridge's own frequency, which moves with the
+bridge: removed at the frequency of the optimum it would leave, or take, a wave in the residuals of
+any other bridge. So it is noise here, in the mixture of its waves on the bridges of many points.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from pre_core.arrays import FloatArray
+from pre_core.crossing import posterior
+from pre_core.crossing.fit import Optimum
+from pre_core.crossing.posterior import PosteriorProblem
+
+_SWINGING = 40
+"""Number of points whose waves of the initial vibration are computed for their mixture."""
+_LEAST_WAVE = 0.03
+"""Smallest wave that is kept, in standard deviations of a residual."""
+
+
+class ResidualParts(NamedTuple):
+    """The coordinates and residuals of a crossing that are distinguished from its nuisances."""
+
+    curved: NDArray[np.int64]
+    """Indices (n,) in y of the coordinates whose effect is not linear, without the offset."""
+    linear: NDArray[np.int64]
+    """Indices (t,) of coordinates that remain and enter linearly."""
+    rows: NDArray[np.int64]
+    """Indices (m,) of the residuals, without the priors of both."""
+    waves: FloatArray
+    """Effect (m, q) of waves of the mismatch that remain."""
+    wave_precision: FloatArray
+    """Prior precision (q, q) of their coefficients."""
+
+
+class Nuisances(NamedTuple):
+    """Nuisances of a crossing, which follow its curved coordinates and offset (n + 1,).
+
+    Residuals (m + r,) include r priors of the mixture of initial vibrations.
+    """
+
+    problem: PosteriorProblem
+    parts: ResidualParts
+    y: FloatArray
+    """The optimum (f,), without initial vibration."""
+    kept: NDArray[np.int64]
+    """Indices (n + 1,) in y of the curved coordinates and of the offset."""
+    own: NDArray[np.int64]
+    """Indices (s,) of the nuisances in y."""
+    of_own: FloatArray  # (s, n + 1) their slopes
+    of_linear: FloatArray  # (t, n + 1) slopes of the linear coordinates
+    basis: FloatArray
+    """Orthonormal columns (m + r, s + r) that span all effects of nuisances and mixture."""
+    step: FloatArray
+    """Gauss-Newton step (s, m + r) of the nuisances by the residuals, all else free, too."""
+    evaluations: int
+    """Number of evaluations that they took."""
+
+    @property
+    def mixture_size(self) -> int:
+        """Number r of waves of the mixture."""
+        return self.basis.shape[1] - self.own.size
+
+
+def place_of_offset(problem: PosteriorProblem) -> int:
+    """Return the index in y of the coefficient that stands for the whole trajectory's offset."""
+    where = posterior.layout(problem)
+    return (where.trajectory.start + where.trajectory.stop) // 2
+
+
+def nuisances_of(
+    found: Optimum,
+    problem: PosteriorProblem,
+    jacobian: FloatArray,
+    parts: ResidualParts,
+    drawn: FloatArray,
+) -> Nuisances:
+    """Return the nuisances of a crossing about its optimum.
+
+    `problem` may have another noise than the optimum's, `jacobian` (rows, f) is that of its
+    residuals there, in the coordinates y. `drawn` (k, n + 1) are points of the curved coordinates
+    and the offset, for the mixture.
+    """
+    where = posterior.layout(problem)
+    y = found.state.y.copy()
+    swing = np.arange(where.swing.start, where.swing.stop)
+    y[swing] = 0.0
+    jacobian = jacobian[parts.rows]
+    # The whole trajectory follows one coefficient, and its other coordinates are relative to it.
+    kept = np.append(parts.curved, place_of_offset(problem))
+    jacobian[:, kept[-1]] = jacobian[:, where.trajectory].sum(axis=1)
+    own = np.setdiff1d(np.arange(y.size), np.concatenate([kept, parts.linear, swing]))
+    swinging = np.repeat(y[None, :], min(_SWINGING, drawn.shape[0]), axis=0)
+    every = drawn.shape[0] // swinging.shape[0]
+    swinging[:, parts.curved] = drawn[::every, :-1][: swinging.shape[0]]
+    mixture = _swing_waves(problem, swinging, parts.rows)
+    r = mixture.shape[1]
+    effects = np.hstack([with_mixture(jacobian[:, own], r), np.vstack([mixture, np.eye(r)])])
+    linear, waves = with_mixture(jacobian[:, parts.linear], r), with_mixture(parts.waves, r)
+    steps = _steps((effects, linear, waves), parts.wave_precision)
+    follow = steps @ with_mixture(jacobian[:, kept], r)
+    s, begin = own.size, effects.shape[1]
+    return Nuisances(
+        problem,
+        parts,
+        y,
+        kept,
+        own,
+        follow[:s],
+        follow[begin : begin + linear.shape[1]],
+        np.linalg.qr(effects)[0],
+        steps[:s],
+        (1 + swing.size) * swinging.shape[0],
+    )
+
+
+def with_mixture(columns: FloatArray, size: int) -> FloatArray:
+    """Return columns (m, n) with zeros for `size` priors of the mixture."""
+    return np.vstack([columns, np.zeros((size, columns.shape[1]))])
+
+
+def unexplained(of: Nuisances, columns: FloatArray) -> FloatArray:
+    """Return what no nuisance explains of columns (m + r, n)."""
+    return np.asarray(columns - of.basis @ (of.basis.T @ columns))
+
+
+def integrated_residuals(of: Nuisances, drawn: FloatArray, *, has_step: bool) -> FloatArray:
+    """Return residuals (m + r, k) at points (k, n + 1), with nuisances integrated out.
+
+    Each point takes an evaluation, and another one if it `has_step` of its own.
+    """
+    where, parts = posterior.layout(of.problem), of.parts
+    moves = drawn - of.y[of.kept]
+    points = np.repeat(of.y[None, :], drawn.shape[0], axis=0)
+    points[:, parts.curved] = drawn[:, :-1]
+    points[:, where.trajectory] += moves[:, -1:]
+    points[:, of.own] += moves @ of.of_own.T
+    points[:, parts.linear] += moves @ of.of_linear.T
+    if has_step:
+        points[:, of.own] += (of.step @ _residuals(of, points)).T
+    return unexplained(of, _residuals(of, points))
+
+
+def _residuals(of: Nuisances, points: FloatArray) -> FloatArray:
+    """Return residuals (m + r, k) at points y (k, f)."""
+    return with_mixture(posterior.all_rows(of.problem, points)[:, of.parts.rows].T, of.mixture_size)
+
+
+def _swing_waves(
+    problem: PosteriorProblem, points: FloatArray, rows: NDArray[np.int64]
+) -> FloatArray:
+    """Return waves (m, r) whose covariance is that of the initial vibration at points (n, f)."""
+    swing = posterior.layout(problem).swing
+    residuals = posterior.all_rows(problem, points)[:, rows]
+    waves = []
+    for place in range(swing.start, swing.stop):
+        swinging = points.copy()
+        swinging[:, place] += 1.0
+        waves.append(posterior.all_rows(problem, swinging)[:, rows] - residuals)
+    directions, spread, _ = np.linalg.svd(np.concatenate(waves).T, full_matrices=False)
+    spread /= np.sqrt(points.shape[0])
+    clear = int((spread > _LEAST_WAVE).sum())
+    return np.asarray(directions[:, :clear] * spread[:clear])
+
+
+def _steps(
+    parts: tuple[FloatArray, FloatArray, FloatArray], wave_precision: FloatArray
+) -> FloatArray:
+    """Return the Gauss-Newton steps (…, m) of all `parts` by the residuals.
+
+    These are the columns (m, …) of nuisances, linear coordinates and waves.
+    """
+    columns = np.hstack(parts)
+    begin = parts[0].shape[1]
+    end = begin + parts[1].shape[1]
+    precision = columns.T @ columns
+    precision[np.arange(begin, end), np.arange(begin, end)] += 1.0
+    precision[end:, end:] += wave_precision
+    return np.asarray(-cho_solve(cho_factor(precision), columns.T))
