@@ -31,7 +31,7 @@ from services.common.files import (
     write_atomically,
 )
 from services.common.naming import count_of
-from services.common.options import CERTIFICATES
+from services.common.options import validations_folder
 from services.common.progress import parts_bar, reading_bar, steps_bar
 from services.execution.dispatch import CrossingExecutor
 from services.execution.inline import InlineExecutor
@@ -78,7 +78,7 @@ def identify_command(
         draws: dict[str, Draws] = {}
         found = _found(request, draws, executing, console)
         _print(console, found, known)
-        _print_validation(console, found, known, asked.validations or CERTIFICATES)
+        _print_validation(console, found, known, validations_folder(asked.validations))
         warn_of_shared_crossings(found.bridges, request.fusing.baselines)
         if asked.json is not None:
             write_atomically(asked.json, results_json(found))
@@ -141,7 +141,7 @@ def _request(asked: IdentifyOptions, files: list[Path]) -> _IdentifyRequest:
     method, seed = asked.search_method, asked.seed
     settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
     warn_of_no_noise(site, method)
-    records = passed_validations(asked.validations or CERTIFICATES, site, settings)
+    records = passed_validations(validations_folder(asked.validations), site, settings)
     return _IdentifyRequest(files, site, settings, fusing, records)
 
 

@@ -21,7 +21,7 @@ from services.cli.settings import IdentifyOptions
 from services.common.errors import InputError
 from services.common.files import check_writable, make_folder, write_atomically
 from services.common.naming import count_of
-from services.common.options import CERTIFICATES
+from services.common.options import validations_folder
 from services.common.progress import progress_bar
 from services.common.stores import Folder, files_below, folder_at
 from services.execution.archive import ArchiveJob, ArchiveResult, identify_archive
@@ -63,7 +63,8 @@ def archive_command(
     Raise InputError for an output of single crossings, a file or folder that cannot be written, no
     site file, or a catalogue that cannot be created.
     """
-    site, json_path, folder = options.site, options.json, options.validations or CERTIFICATES
+    site, json_path = options.site, options.json
+    folder = validations_folder(options.validations)
     _check(options, into)
     problems: list[str] = []
     known = _site_of(options.recordings, site)

@@ -188,6 +188,11 @@ def validations_option(text: str, *, group: str = "") -> Any:
     return opt(text, Path, flags=("--validations",), group=group, metavar="DIR")
 
 
+def validations_folder(given: Path | None) -> Path:
+    """Return the folder of validation records: the given one, else the usual one."""
+    return given or CERTIFICATES
+
+
 def baseline_option() -> Any:
     """Return `--baseline`: earlier results to compare with."""
     text = "results that the bridge is compared with (default: those that the site file names)"

@@ -15,6 +15,7 @@ from services.common.options import (
     output_option,
     positional,
     site_option,
+    validations_folder,
     validations_option,
 )
 
@@ -74,7 +75,7 @@ def _report(asked: ReportOptions) -> int:
         raise InputError(f"{output}: the name of an HTML file (.html) is expected")
     pdf = output.with_suffix(".pdf")
     check_validations(asked.validations)
-    records = asked.validations or CERTIFICATES
+    records = validations_folder(asked.validations)
     check_writable(output)
     if asked.pdf:
         check_writable(pdf, kinds=(PDF,))

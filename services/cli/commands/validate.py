@@ -25,6 +25,7 @@ from services.common.options import (
     scenario,
     seed_option,
     site_option,
+    validations_folder,
     validations_option,
     whole,
 )
@@ -173,7 +174,7 @@ def _validate(asked: ValidateOptions) -> int:
         from services.cli.validate_site import validate_site_command
 
         _refuse(asked, _OF_METHODS - _OF_CERTIFICATES, "only with --method")
-        asked = replace(asked, validations=asked.validations or CERTIFICATES)
+        asked = replace(asked, validations=validations_folder(asked.validations))
         return validate_site_command(_of_kind(CertificateOptions, asked), a_console())
     _refuse(asked, _OF_CERTIFICATES - _OF_METHODS, "only with --site, no --method")
     code: int
