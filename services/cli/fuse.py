@@ -6,12 +6,15 @@ from typing import TYPE_CHECKING
 
 from schemas.results import Results, load_results, results_json
 from services.cli.bridge_table import print_bridge
-from services.cli.identify import warn_of_shared_crossings
+from services.cli.identify import print_validation, warn_of_shared_crossings
 from services.cli.settings import FuseOptions
 from services.common.errors import InputError
 from services.common.files import check_writable, write_atomically
+from services.common.options import validations_folder
 from services.common.progress import Steps, parts_bar, steps_bar
 from services.execution.fuse_results import crossings_to_fuse, fuse_crossings
+from services.history.validation_files import check_validations, pairs_without_validation
+from services.ledger.site_of_results import site_of_results
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -24,6 +27,7 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
     file, results without a crossing that can be fused, or of several realms.
     """
     paths, json_path, baseline = asked.results, asked.json, asked.baseline
+    check_validations(asked.validations)
     if json_path is not None:
         check_writable(json_path)
     with steps_bar("reading", console) as progress:
@@ -47,11 +51,36 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
         if number > 0:
             console.print()
         print_bridge(console, elements, fused.results.bridges[name])
+    newest, _ = max(zip(paths, files, strict=True), key=lambda one: one[1].created)
+    _print_validations(console, newest, fused.results, asked)
     if stored is not None:
         warn_of_shared_crossings(fused.results.bridges, stored[1].bridges)
     if json_path is not None:
         write_atomically(json_path, results_json(fused.results))
     return 0
+
+
+def _print_validations(
+    console: "Console", newest: Path, fused: Results, asked: FuseOptions
+) -> None:
+    """Print which intervals no passed site validation covers, as far as a site file is known."""
+    pairs = pairs_without_validation(fused.crossings)
+    if not pairs:
+        return
+    try:
+        site = site_of_results(newest, fused, asked.site)
+    except InputError:
+        if asked.site is not None:
+            raise
+        for pair in pairs:
+            console.print(
+                f"{pair}: the results name no passed site validation; "
+                "with --site SITE.toml it is looked up",
+                highlight=False,
+                soft_wrap=True,
+            )
+    else:
+        print_validation(console, fused, site, validations_folder(asked.validations))
 
 
 def _loaded(paths: Sequence[Path], progress: Steps) -> Iterator[Results]:

@@ -78,7 +78,7 @@ def identify_command(
         draws: dict[str, Draws] = {}
         found = _found(request, draws, executing, console)
         _print(console, found, known)
-        _print_validation(console, found, known, validations_folder(asked.validations))
+        print_validation(console, found, known, validations_folder(asked.validations))
         warn_of_shared_crossings(found.bridges, request.fusing.baselines)
         if asked.json is not None:
             write_atomically(asked.json, results_json(found))
@@ -252,7 +252,7 @@ def _print(console: "Console", found: Results, site: Site) -> None:
             console.print(_as_state(site.bridge(name), state), highlight=False)
 
 
-def _print_validation(console: "Console", found: Results, site: Site, folder: Path) -> None:
+def print_validation(console: "Console", found: Results, site: Site, folder: Path) -> None:
     """Print which intervals no passed site validation covers, once for a bridge."""
     for bridge in dict.fromkeys(crossing.bridge for crossing in found.crossings):
         crossed = (crossing for crossing in found.crossings if crossing.bridge == bridge)

@@ -93,3 +93,9 @@ class FuseOptions:
     )
     baseline: Path | None = baseline_option()
     fuse_suspect: bool = fuse_suspect_option()
+    site: Path | None = site_option(
+        "site file of the bridges (default: that of a recording in the results' folder)"
+    )
+    validations: Path | None = validations_option(
+        f"folder of validation records (default: {CERTIFICATES})"
+    )

@@ -5,7 +5,11 @@ from pathlib import Path
 import pytest
 
 import driveby
+from schemas.site_file import site_toml
 from services.cli.main import main
+from services.history.validation_files import save
+from services.simulation.drive import paper_site
+from tests.builders.certificates import certificate
 from tests.unit.identification.test_fusing import crossing, write
 
 
@@ -82,3 +86,32 @@ def test_baseline_of_the_same_crossings_is_a_warning(
     driveby.fuse(now, baseline=before)
     warned = [str(one.message) for one in recwarn if one.category is UserWarning]
     assert [one[: len(line or "")] for one in warned] == ([] if line is None else [line])
+
+
+def test_fused_intervals_without_a_passed_site_validation_have_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site, toml = paper_site(), tmp_path / "site.toml"
+    toml.write_text(site_toml(site))
+    path = write(tmp_path / "r.json", [crossing(n) for n in range(2)])
+    asked = ["fuse", str(path)]
+    assert main(asked) == 0
+    line = "truck-1 on bridge-1: the results name no passed site validation; with --site SITE.toml"
+    assert capsys.readouterr().out.count(line) == 1
+    asked += ["--site", str(toml), "--validations", str(tmp_path)]
+    for words in ("No site validation of", "Site validation of"):
+        assert main(asked) == 0
+        assert capsys.readouterr().out.count(f"bridge-1: {words} truck-1 on this bridge") == 1
+        save(tmp_path, certificate(site, passed=False))
+    save(tmp_path, certificate(site))
+    assert main(asked) == 0
+    assert "validation" not in capsys.readouterr().out
+
+
+def test_folder_of_validation_records_and_site_file_must_exist(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path / "r.json", [crossing(0)])
+    for option in ("--validations", "--site"):
+        assert main(["fuse", str(path), option, str(tmp_path / "none")]) == 2
+        assert str(tmp_path / "none") in capsys.readouterr().err

@@ -25,7 +25,7 @@ from schemas.site_file import parse_site, site_hash, site_toml
 from schemas.topics import Message
 from schemas.validation_records import VehicleBridgePair, pair_hash
 from services.cli import main as cli
-from services.cli.identify import _print_validation, identify_command
+from services.cli.identify import identify_command, print_validation
 from services.cli.settings import IdentifyOptions
 from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_lat_lon
@@ -413,13 +413,13 @@ def test_bridge_without_site_validation_has_one_line(
     found = results_of(site, some_crossing("a"), some_crossing("b", entry=60.0))
     failed = certificate(site, passed=False)
     for folder, words in ((tmp_path, "No site validation of"), (tmp_path, "Site validation of")):
-        _print_validation(Console(), found, site, folder)
+        print_validation(Console(), found, site, folder)
         out = capsys.readouterr().out
         assert out.startswith(f"bridge-1: {words} truck-1 on this bridge")
         assert out.count("bridge-1:") == 1
         save(folder, failed)
     save(tmp_path, certificate(site))
-    _print_validation(Console(), found, site, tmp_path)
+    print_validation(Console(), found, site, tmp_path)
     assert capsys.readouterr().out == ""
 
 
