@@ -159,9 +159,9 @@ def check_overlap(
     side = "after" if quarters > 0 else "before"
     raise InputError(
         f"{part.sheet.path}: begins {abs(quarters) / 4:g} h {side} {name}, which looks "
-        "like another time zone; the clocks must agree: in [file.time] of a map (--map) set "
-        f"offset_s = {-900.0 * quarters:.0f} if the positions are wrong, or {900.0 * quarters:.0f} "
-        f"for {name} if it is"
+        "like another time zone; the clocks must agree: give a map (--map) of [[file]], "
+        f'name = "{part.sheet.path.name}", [file.time], offset_s = {-900.0 * quarters:.0f} if the '
+        f'positions are wrong, or of "{name}" with {900.0 * quarters:.0f} if it is'
     )
 
 

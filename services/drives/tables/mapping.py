@@ -178,14 +178,17 @@ def _first_line(error: ValidationError) -> str:
     place = ".".join(str(part) for part in problem["loc"] if not _is_branch(part))
     if problem["type"] == "extra_forbidden":
         return f"{place} is not a known key, check its spelling or remove it"
+    shown = str(problem["input"])[:40]
+    if problem["type"] == "tuple_type":
+        return f'{place} is "{shown}", it must be a list: [[{place}]] before the keys of each'
     choices = [
         choice
         for one in problems
         if one["loc"][: len(problem["loc"]) - 1] == problem["loc"][:-1]
         for choice in re.findall(r"'([^']*)'", str(one.get("ctx", {}).get("expected", "")))
     ]
-    expected = ", ".join(choices) or problem["msg"][:1].lower() + problem["msg"][1:]
-    shown = str(problem["input"])[:40]
+    words = problem["msg"].removeprefix("Input should be ")
+    expected = ", ".join(choices) or words[:1].lower() + words[1:]
     return f'{place} is "{shown}", it must be {"one of " * bool(choices)}{expected}'
 
 

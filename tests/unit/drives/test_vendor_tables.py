@@ -802,8 +802,9 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, str | bytes]], str]] = {
         lambda: pair(with_times(ACCEL, ACCEL["time_s"] + 3600)),
         (
             "gps_00.csv: begins 1 h before accel_00.csv, which looks like another time zone; "
-            "the clocks must agree: in [file.time] of a map (--map) set offset_s = 3600 if the "
-            "positions are wrong, or -3600 for accel_00.csv if it is"
+            'the clocks must agree: give a map (--map) of [[file]], name = "gps_00.csv", '
+            "[file.time], offset_s = 3600 if the positions are wrong, "
+            'or of "accel_00.csv" with -3600 if it is'
         ),
     ),
     "local times": (
@@ -950,7 +951,9 @@ def test_doubtful_table_is_refused_in_a_line_that_helps(name: str, tmp_path: Pat
             'speed_mps.unit is "kmh", it must be one of',
         ),
         ("[[file]]\nheader_line = 1.5", 'file.0.header_line is "1.5", it must be'),
-        ("file = 3", 'file is "3", it must be'),
+        ("[[file]]\nheader_line = 'a'", 'file.0.header_line is "a", it must be a valid integer'),
+        ("file = 3", 'file is "3", it must be a list: [[file]]'),
+        ("[file.time]\noffset_s = 3600", "it must be a list: [[file]] before the keys of each"),
         ("[[file]\n", "is not TOML"),
     ],
 )
