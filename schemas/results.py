@@ -10,6 +10,7 @@ from typing import Annotated, Final, Literal, NamedTuple, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
+from schemas.errors import InputError
 from schemas.fusion import FusionLikelihood
 from schemas.json_file import load_json
 from schemas.reasons import BRIDGE_REASON_TEXTS, BridgeReason, Reason, texts
@@ -395,4 +396,14 @@ def results_json(content: Results) -> str:
 
 def load_results(path: Path) -> Results:
     """Read a results file; raise InputError in one line if it is not one."""
+    if path.suffix == ".mcap" and path.is_file():
+        raise InputError(
+            f"{path}: is a recording, results are expected: "
+            f"driveby identify {path} --json RESULTS.json computes them"
+        )
+    if path.is_dir():
+        raise InputError(
+            f"{path}: is a folder, results files are expected: those of a worker are "
+            f"{path}/results-*.json, and driveby identify --into writes one with --json"
+        )
     return load_json(Results, path, "a results file")

@@ -103,6 +103,10 @@ def fuse_crossings(
             unfused[bridge] = len(of)
         else:
             states[bridge], bridges[bridge] = state, elements
+    if not found.crossings:
+        raise InputError(
+            f"{name}: holds no crossing; driveby identify --into writes crossings with --json"
+        )
     if not states:
         raise InputError(f"{name}: no crossing that could be fused; identify with method pre")
     last = found.last

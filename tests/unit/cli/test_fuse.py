@@ -36,14 +36,26 @@ def test_wider_intervals_are_explained_for_one_crossing_only(
         assert ("single crossing: intervals include" in out) is output
 
 
-def test_a_recording_is_refused_with_what_is_wanted(
-    project: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("command", ["fuse", "report"])
+def test_a_recording_or_folder_is_refused_with_what_is_wanted(
+    command: str, project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recording = project / "recordings/sample/crossing.mcap"
-    assert main(["fuse", str(recording)]) == 2
-    error = capsys.readouterr().err
-    assert f"driveby identify {recording} --json RESULTS.json computes them" in error
-    assert error.count("\n") == 1
+    for path, words in (
+        (recording, f"driveby identify {recording} --json RESULTS.json computes them"),
+        (tmp_path, f"is a folder, results files are expected: those of a worker are {tmp_path}/"),
+    ):
+        assert main([command, str(path)]) == 2
+        error = capsys.readouterr().err
+        assert words in error
+        assert error.count("\n") == 1
+
+
+def test_results_without_a_crossing_name_where_crossings_come_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["fuse", str(write(tmp_path / "bridges.json", []))]) == 2
+    assert "holds no crossing; driveby identify --into" in capsys.readouterr().err
 
 
 def test_combined_days_name_the_commands_that_show_a_change(
