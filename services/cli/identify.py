@@ -49,7 +49,7 @@ from services.identification.comparison import baseline_cautions
 from services.identification.methods import lacks_noise
 from services.ledger.baselines import baselines_of
 from services.recordings.recording import read_messages
-from services.recordings.remote import all_fetched, is_folder_of_recordings
+from services.recordings.remote import Source, all_fetched, is_folder_of_recordings
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -107,6 +107,7 @@ def _check(
     """Raise InputError for inputs and outputs that cannot be used."""
     check_validations(asked.validations)
     for source in asked.recordings:
+        check_no_tables(source)
         if is_folder_of_recordings(source):
             raise InputError(
                 f"{source}: is a folder; give recordings, or --into DIR for its results"
@@ -122,6 +123,15 @@ def _check(
         check_folder_writable(asked.figures)
     if asked.json is not None and asked.json.suffix != ".json":
         _log.warning("%s: the file will hold JSON; its usual name ends in .json", asked.json)
+
+
+def check_no_tables(source: Source) -> None:
+    """Raise InputError if a local folder has CSV files and no recording."""
+    if isinstance(source, Path) and any(source.glob("*.csv")) and not any(source.rglob("*.mcap")):
+        raise InputError(
+            f"{source}: is a folder of CSV files, recordings are expected: "
+            f"driveby import {source} --site SITE.toml -o DRIVE.mcap makes one"
+        )
 
 
 class _IdentifyRequest(NamedTuple):

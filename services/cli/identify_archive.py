@@ -15,7 +15,11 @@ from schemas.validation_records import VehicleBridgePair
 from services.catalogue.index import update_catalog
 from services.catalogue.positions import crossings_of
 from services.cli.bridge_table import print_bridge
-from services.cli.identify import warn_of_no_noise, warn_of_shared_crossings
+from services.cli.identify import (
+    check_no_tables,
+    warn_of_no_noise,
+    warn_of_shared_crossings,
+)
 from services.cli.parsing import EXIT_SOMETHING_LOST
 from services.cli.settings import IdentifyOptions
 from services.common.errors import InputError
@@ -122,6 +126,8 @@ def _check(options: IdentifyOptions, into: Path) -> None:
                 f"--{name}: cannot be combined with --into; identify single recordings without it"
             )
     check_validations(options.validations)
+    for source in options.recordings:
+        check_no_tables(source)
     if options.json is not None:
         check_writable(options.json)
     make_folder(into)

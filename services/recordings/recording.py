@@ -252,7 +252,8 @@ def _scan(
         if size == 0:
             raise InputError(f"{path}: is empty; an MCAP recording is expected")
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise InputError(f"{path}: is not an MCAP file; a recording (.mcap) is expected")
+            how = "; driveby import makes one of CSV files" if path.suffix == ".csv" else ""
+            raise InputError(f"{path}: is not an MCAP file; a recording (.mcap) is expected{how}")
         channels: dict[int, tuple[Key, int] | None] = {}
         has_looked = False
         for item in watched(scan(file, start), file, progress):

@@ -406,6 +406,22 @@ def test_method_and_seed_reach_the_search(recording: Path) -> None:
     assert answers[0] != answers[2]
 
 
+@pytest.mark.parametrize("into", [False, True])
+def test_csv_files_are_refused_with_the_command_that_converts_them(
+    into: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    table = folder / "accel_00.csv"
+    table.write_text("time_s,sprung_front\n")
+    more = ["--into", str(tmp_path / "results")] if into else []
+    assert cli.main(["identify", str(folder), *more]) == 2
+    line = capsys.readouterr().err
+    assert f"driveby import {folder} --site SITE.toml -o DRIVE.mcap makes one" in line
+    assert cli.main(["identify", str(table)]) == 2
+    assert "driveby import makes one of CSV files" in capsys.readouterr().err
+
+
 def test_bridge_without_site_validation_has_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
