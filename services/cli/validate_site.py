@@ -4,7 +4,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
@@ -25,6 +25,12 @@ from services.simulation.validation_trial import CROSSINGS, ValidationTrial, run
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+
+_AFTER_FAILURE: Final = (
+    "do not rely on intervals of a pair that failed: check the site file, try another number of "
+    "elements or another truck, and validate again"
+)
 
 
 def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
@@ -53,6 +59,8 @@ def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
             path = save(asked.validations, certificate)
             have_passed &= certificate.passed
             console.print(line_of(certificate, path), highlight=False, soft_wrap=True)
+    if not have_passed:
+        console.print(_AFTER_FAILURE, highlight=False, soft_wrap=True)
     return 0 if have_passed else 1
 
 

@@ -58,7 +58,8 @@ def test_every_pair_gets_a_line_and_a_file(
 ) -> None:
     folder = tmp_path / "made" / "here"
     assert validate("--site", site, "--validations", folder, "--seed", 4) == 1
-    lines = capsys.readouterr().out.splitlines()
+    *lines, advice = capsys.readouterr().out.splitlines()
+    assert "check the site file, try another number of elements or another truck" in advice
     assert [line.split(":")[0] for line in lines] == [
         "truck-1 on bridge-1",
         "truck-1 on bridge-2",
