@@ -55,6 +55,8 @@ _VALUE_PT, _LOSS_PT, _LOSS_ABOVE_VALUE_PT = 5.0, 6.0, 21.0
 """Distances of labels from the top of an interval, in points."""
 _CHARACTERS = 118
 """Maximum length of a line of reasons between the figure's edges."""
+_BESIDE_VERDICT = 110
+"""Maximum length of a finding next to the word of a good verdict."""
 
 NOMINAL_LINE: dict[str, Any] = {"color": MUTED, "linewidth": 1.0, "linestyle": (0, (4, 3))}
 BASELINE_COLOUR = VERDICT_COLOURS["good"]
@@ -122,8 +124,10 @@ def draw_verdict(
         figure.text(LEFT, top, "verdict: good", color=colour, fontweight="bold", **words)
         if sentences:
             more = f" (and {len(sentences) - 1} more)" if len(sentences) > 1 else ""
-            short = textwrap.shorten(sentences[0], width=100 - len(more), placeholder=" …") + more
-            figure.text(LEFT + 0.12, top, short, color=INK, parse_math=False, **words)
+            short = shortened(sentences[0], _BESIDE_VERDICT - len(more)) + more
+            figure.text(
+                LEFT + 0.12, top, short, color=INK, fontsize=8.5, va="top", parse_math=False
+            )
         return
     height = 0.40 / figure.get_figheight()
     figure.add_artist(
@@ -144,6 +148,14 @@ def draw_verdict(
     text = textwrap.shorten(" ".join(reasons), width=_CHARACTERS, placeholder=" …")
     top -= 0.165 / figure.get_figheight()
     figure.text(LEFT + 0.01, top, text, fontsize=8.5, color=INK, va="top", parse_math=False)
+
+
+def shortened(sentence: str, width: int) -> str:
+    """Return a sentence of at most `width` characters; an interval is left out as a whole."""
+    if len(sentence) <= width:
+        return sentence
+    without = sentence.partition(" (95 % interval")[0]
+    return textwrap.shorten(f"{without} …", width=width, placeholder=" …")
 
 
 class BarPlaces(NamedTuple):

@@ -17,7 +17,7 @@ from schemas.reasons import Reason
 from services.common.errors import InputError
 from services.common.language import ENGLISH
 from services.viewer.crossing_view import CrossingView, RoadView
-from services.viewer.drawing import STYLE
+from services.viewer.drawing import STYLE, shortened
 from services.viewer.figure import crossing_figure, draw_crossing
 from tests.unit.words import assert_words_apart, words
 
@@ -215,3 +215,12 @@ def test_profiles_of_a_tandem_are_named_by_axle_number() -> None:
     assert not any("front" in text for text in written)
     of_two = {text.get_text() for text in words(draw(view()))}
     assert {"profile of the front wheel", "profile of the rear wheel", "front − rear"} < of_two
+
+
+def test_a_finding_is_cut_before_its_interval_or_not_at_all() -> None:
+    finding = (
+        "Element 4, 12.9 to 17.1 m: 60 % less stiff than the others (95 % interval 60 to 61 %)."
+    )
+    assert shortened(finding, 110) == finding
+    assert shortened(finding, 80) == "Element 4, 12.9 to 17.1 m: 60 % less stiff than the others …"
+    assert shortened(finding, 40) == "Element 4, 12.9 to 17.1 m: 60 % less …"
