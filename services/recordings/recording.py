@@ -96,7 +96,8 @@ def read_messages(
                 check_message(path, item)
             yield item
         elif isinstance(item, Damage):
-            warn(f"{path}: {item.text}")
+            grows = item.is_cut_off and is_being_written(path)
+            warn(f"{path}: {'is being written, read as far as it is' if grows else item.text}")
     if not found:
         raise InputError(f"{path}: holds no driveby message; a recording of a truck is expected")
 

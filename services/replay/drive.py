@@ -11,7 +11,7 @@ from schemas.topics import Key, Message, parse_key, topic
 from services.catalogue.contents import RecordingSummary, summarise_recording
 from services.common.errors import InputError
 from services.recordings.merge import TimedMessage, read_together, recordings_in
-from services.recordings.recording import check_message
+from services.recordings.recording import check_message, is_being_written
 from services.replay.choice import (
     ReplaySelection,
     ReplayWindow,
@@ -74,7 +74,9 @@ def open_drive(
             _log.warning("%s; skipped", error)
             continue
         if found.info.truncated or found.info.damaged_chunks:
-            _log.warning("%s: damaged, only its intact chunks are replayed", path)
+            grows = not found.info.damaged_chunks and is_being_written(path)
+            state = "being written" if grows else "damaged"
+            _log.warning("%s: %s, only its intact chunks are replayed", path, state)
         surveys.append(found)
         stretches += _stretches(times_ns)
     if not surveys:

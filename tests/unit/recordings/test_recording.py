@@ -1,5 +1,6 @@
 """Recordings: what goes in comes out, and damage costs only what was damaged."""
 
+import fcntl
 import io
 import os
 import random
@@ -97,6 +98,20 @@ def test_other_readers_find_schemas_that_decode_by_themselves(tmp_path: Path) ->
         assert channel.message_encoding == "protobuf"
         assert channel.metadata["boot_id"] == str(2**63 + 5)
     assert read_site(path) is None
+
+
+def test_a_file_that_is_being_written_is_not_called_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write_recording(path, fixes(2000), site_toml=SITE, reason="simulated")
+    path.write_bytes(path.read_bytes()[:-100])
+    for is_written, words in ((True, "is being written"), (False, "cut off at byte")):
+        heard: list[str] = []
+        with path.open("r+b") as writer:
+            if is_written:
+                fcntl.flock(writer, fcntl.LOCK_EX)
+            assert list(read_messages(path, warn=heard.append)) == list(fixes(2000))
+        (line,) = heard
+        assert line.startswith(f"{path}: {words}")
 
 
 def test_a_file_cut_off_anywhere_keeps_its_whole_chunks(tmp_path: Path) -> None:
