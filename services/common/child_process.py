@@ -16,7 +16,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
 from typing import NamedTuple
 
@@ -26,6 +28,8 @@ _CLEAN_UP_S = 2.0
 """Time to remove incomplete files; then the process ends in any case."""
 _POLL_S = 0.1
 """Longest delay of the parent's end while a child works."""
+_OF_THE_GROUP = (signal.SIGINT, signal.SIGTERM)
+"""Signals that a terminal or supervisor sends to all processes of a service."""
 _NICE = 15
 """Priority of children that run gently."""
 
@@ -69,6 +73,26 @@ def run_gently(arguments: Sequence[str], closing: threading.Event) -> ChildOutpu
             if process.returncode == EXIT_INTERRUPTED:
                 return None
             return ChildOutput(process.returncode, out, log)
+
+
+@contextmanager
+def group_signals_blocked() -> Iterator[None]:
+    """Block the signals of a group in processes started here, which would die while they load.
+
+    The tracker of resources would unblock them at its start, so it is started first.
+    """
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_THE_GROUP)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def ignore_group_signals() -> None:
+    """Leave the signals of a group to the parent of this process, which decides what to do."""
+    for number in _OF_THE_GROUP:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def end_with_parent() -> None:

@@ -30,6 +30,7 @@ from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 from schemas.results import BridgeResult, CrossingResult
+from services.common.child_process import group_signals_blocked, ignore_group_signals
 from services.common.errors import FailureError
 from services.execution.dispatch import FusionResult, RunningCrossing, TaskResult, failed_result
 from services.execution.hang_watchdog import HangWatchdog, TaskLimits
@@ -389,7 +390,7 @@ class _Slot:
         self._executor = ProcessPoolExecutor(
             1, mp_context=_SPAWN, initializer=_prepare, initargs=(its_end, self._send, self._begin)
         )
-        with _STARTING:
+        with _STARTING, group_signals_blocked():
             others = set(active_children())
             self.is_warm = self._executor.submit(os.getpid)  # which starts the process
             (self._process,) = set(active_children()) - others
@@ -424,9 +425,7 @@ _HERE: list[InlineExecutor] = []
 
 
 def _prepare(lifeline: Connection, send: Connection, begin: _ProcessSetup) -> None:
-    # A signal to the whole group is for the parent, which decides what to do.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    ignore_group_signals()
     threading.Thread(target=_end_with, args=(lifeline,), name="lifeline", daemon=True).start()
     _HERE.append(
         InlineExecutor(report=lambda *progress: send.send(progress), identify=begin.identify)

@@ -1,5 +1,8 @@
 """Crossings in processes of their own: the same results, whatever becomes of a process."""
 
+import multiprocessing
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -74,6 +77,17 @@ def all_of(processes: ProcessExecutor) -> list[TaskResult]:
         found += processes.collect(0.1)
     assert not processes.is_busy
     return found
+
+
+def test_signals_to_the_group_are_left_to_the_parent_while_a_process_starts() -> None:
+    before = set(multiprocessing.active_children())
+    with ProcessExecutor(1, prepare=nothing) as processes:
+        (child,) = set(multiprocessing.active_children()) - before
+        assert child.pid is not None
+        for number in (signal.SIGINT, signal.SIGTERM):
+            os.kill(child.pid, number)
+        processes.wait_until_warm()
+    assert not {signal.SIGINT, signal.SIGTERM} & signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 def pairs() -> Iterator[Any]:
