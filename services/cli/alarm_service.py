@@ -80,6 +80,7 @@ def serve(
         alarms = AlarmPublisher(put)
         alarms.publish_changes(folder, time.time_ns())  # a check may take minutes
         check()
+        print(f"ready, checking {folder} every {every_s / 60.0:g} min", flush=True)
         due_s = time.monotonic() + every_s
         while not stop.is_set():
             if time.monotonic() >= due_s:

@@ -291,6 +291,7 @@ def test_a_history_that_is_away_for_a_while_ends_nothing(
     start_logger(start, endpoint, tmp_path / "live.mcap")
     serve = ["alarm", "serve", "--history", str(history), "--endpoint", endpoint]
     with RunningCommand(*serve, "--every", "0.01") as serving:
+        assert serving.says("^ready").endswith(" every 0.01 min")
         until((history / "alarms/checked.json").exists, "the first look")
         history.rename(tmp_path / "away")
         serving.says(r"history: no such folder.*; checking again in 1 s$")

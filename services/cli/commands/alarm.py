@@ -30,7 +30,7 @@ _MAX_LINES = 20
 """Maximum number of listed bridges without monitoring."""
 _HOW = (
     "an alarm compares periods; identify and fuse combine all crossings, which hides a change\n"
-    "see it: driveby history BRIDGE --period week --figures DIR; inspect the bridge, then "
+    "see it: driveby history BRIDGE --period {period} --figures DIR; inspect the bridge, then "
     "acknowledge the alarm: driveby alarm ack BRIDGE --by NAME --note TEXT"
 )
 
@@ -89,7 +89,7 @@ def _alarm(options: AlarmOptions) -> int:
     if bridge is not None:
         return _acknowledge(options, bridge)
     if what == "list":
-        return _list(options.history)
+        return _list(options.history, options.period)
     if what == "serve":
         return _serve(options)
     checked = _checked(options)
@@ -99,7 +99,7 @@ def _alarm(options: AlarmOptions) -> int:
         print(alarm_line(alarm))
     _print_watches(options.history)
     if checked.standing:
-        print(_HOW)
+        print(_HOW.format(period=options.period))
     return 0
 
 
@@ -128,7 +128,7 @@ def _checked(options: AlarmOptions) -> "AlarmCheck":
     return checked
 
 
-def _list(folder: Path) -> int:
+def _list(folder: Path, period: str) -> int:
     from services.history.alarm_files import alarms_of, bridges_with_alarms
     from services.history.history_store import bridges_of
 
@@ -144,7 +144,7 @@ def _list(folder: Path) -> int:
         print("no alarms")
     _print_watches(folder)
     if standing:
-        print(_HOW)
+        print(_HOW.format(period=period))
     return 0
 
 

@@ -17,12 +17,15 @@ from schemas.results import (
 )
 from services.cli import main as cli
 from services.cli.parsing import EXIT_SOMETHING_LOST
+from services.common.files import make_folder, write_atomically
 from services.execution import result_store as store_module
 from services.execution.result_store import BRIDGES, ResultStore, StoredResult, kept_results
+from services.history.alarm_files import alarms_folder
 from services.history.history_store import partition, read_partition
 from services.identification.bridge_state import with_common_shares
 from services.identification.known import search_hash
 from tests.fleet import DAY_S
+from tests.unit.history.test_bridge_history import alarm
 from tests.unit.history.test_history_store import BEGIN_S, crossings
 
 HEADER = ResultHeader("0.1.0", BEGIN_S + 50 * DAY_S, "1" * 64, {"method": "pre"}, 7)
@@ -156,3 +159,18 @@ def test_list_of_alarms_of_a_single_bridge(
     first, second, third = capsys.readouterr().out.splitlines()
     assert (first, second) == ("no alarms", "the bridge is not monitored")
     assert third.startswith("bridge-1 in realm sim-fleet: Not monitored: ")
+
+
+def test_advice_on_an_alarm_names_the_period_of_the_alarms(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    history = tmp_path / "history"
+    one = alarm()
+    where = alarms_folder(history, one.realm, one.bridge)
+    make_folder(where)
+    make_folder(history / f"crossings/realm={one.realm}/bridge={one.bridge}")
+    write_atomically(where / f"{one.alarm_id}.json", one.model_dump_json())
+    for period in ("week", "day"):
+        asked = ["alarm", "list", "--history", str(history), "--period", period]
+        assert cli.main(asked) == 0
+        assert f"driveby history BRIDGE --period {period} " in capsys.readouterr().out
