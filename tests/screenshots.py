@@ -173,7 +173,7 @@ def take(shot: Shot, folder: Path, size: str = "1400x850") -> bytes:
         return taken
 
 
-def take_report(folder: Path, size: str = "794,1046") -> bytes:
+def take_report(folder: Path, size: str = "794,1084") -> bytes:
     """The top of the sample's report as a browser shows it, as wide as A4 at 96 pixels an inch."""
     html = folder / "report.html"
     site = folder / "site.toml"

@@ -126,7 +126,7 @@ def draw_verdict(
             more = f" (and {len(sentences) - 1} more)" if len(sentences) > 1 else ""
             short = shortened(sentences[0], _BESIDE_VERDICT - len(more)) + more
             figure.text(
-                LEFT + 0.12, top, short, color=INK, fontsize=8.5, va="top", parse_math=False
+                LEFT + 0.12, top, short, color=INK, fontsize=8.3, va="top", parse_math=False
             )
         return
     height = 0.40 / figure.get_figheight()
