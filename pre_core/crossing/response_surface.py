@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, qr
+from scipy.linalg import cho_factor, cho_solve
 
 from pre_core.arrays import FloatArray
 from pre_core.crossing.nuisances import (
@@ -20,11 +20,10 @@ from pre_core.crossing.nuisances import (
     with_mixture,
 )
 
-POINTS, POINTS_OF_DRAWS = 1920, 640
+POINTS, POINTS_OF_DRAWS = 1920, 960
 """Numbers of points to which a surface is fitted: one that is fused, fourteen for each of its
-coefficients, and one of a single crossing. With a third as many the remainder of third order enters
-the slopes as if it were knowledge of the bridge: fused intervals were up to 1.6 times too narrow,
-and other points moved them by twice their width.
+coefficients, and one of a single crossing. Fewer, or repeated ones, have slopes with so much of the
+remainder of third order that other points move fused elements by twice their width.
 """
 _TOGETHER = 160
 """Number of points evaluated together: their residuals take some ten megabytes."""
@@ -83,12 +82,11 @@ def response_surface(
     waves = unexplained(of, with_mixture(parts.waves, r))
     # Zero is what the site file excludes.
     centre, size = drawn.mean(axis=0), np.maximum(drawn.std(axis=0), _LEAST_SIZE)
-    fitted = _fit_parabolas(
+    fitted, error = _fit_parabolas(
         (drawn - centre) / size,
         lambda some: integrated_residuals(of, drawn[some], has_step=has_step),
     )
-    # The residuals' squares are all that counts, so that a rotation makes them few.
-    (few,) = qr(np.hstack([fitted, linear, waves]), mode="r")
+    few = _root_of_squares(np.hstack([fitted, linear, waves]), error)
     n = of.kept.size
     ends = np.cumsum([1, n, fitted.shape[1] - 1 - n, linear.shape[1]])
     constant, slopes, products, linear, waves = np.hsplit(few[: few.shape[1]], ends)
@@ -106,16 +104,39 @@ def response_surface(
     )
 
 
-def _fit_parabolas(u: FloatArray, values_at: Callable[[slice], FloatArray]) -> FloatArray:
-    """Return constant, slopes and products (m, 1 + n + pairs) of values at points u (k, n).
+def _fit_parabolas(
+    u: FloatArray, values_at: Callable[[slice], FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return constant, slopes and products (m, p) of values at points u (k, n), and their error.
 
-    `values_at` returns those (m, …) of some points, so that not all are in memory.
+    `values_at` returns those (m, …) of some points, so that not all are in memory. The error (p, p)
+    is the covariance that the remainder causes, summed over the m values.
     """
     design = np.column_stack([np.ones(u.shape[0]), u, _products(u)])
-    normal = design.T @ design
+    gram = design.T @ design
+    normal = gram.copy()
     normal[1:, 1:] += _RIDGE * np.eye(normal.shape[0] - 1)
     image: FloatArray | float = 0.0
+    squares = 0.0
     for first in range(0, u.shape[0], _TOGETHER):
         some = slice(first, first + _TOGETHER)
-        image = image + design[some].T @ values_at(some).T
-    return np.asarray(cho_solve(cho_factor(normal), image).T)
+        values = values_at(some)
+        image = image + design[some].T @ values.T
+        squares += float(np.sum(values * values))
+    inverse = cho_solve(cho_factor(normal), np.eye(normal.shape[0]))
+    fitted = inverse @ image
+    degrees = max(1.0, u.shape[0] - float(np.sum(inverse * gram)))
+    remainder = (squares - float(np.sum(fitted * image))) / degrees
+    return np.asarray(fitted.T), remainder * inverse
+
+
+def _root_of_squares(columns: FloatArray, error: FloatArray) -> FloatArray:
+    """Return few rows (q, q) with the products of `columns` (m, q), less what is error in them.
+
+    The residuals' squares are all that counts. Those of fitted coefficients are too large by their
+    `error` (p, p), which would count as knowledge of the bridge, in every crossing again.
+    """
+    squares = columns.T @ columns
+    squares[: error.shape[0], : error.shape[0]] -= error
+    values, vectors = np.linalg.eigh(squares)
+    return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)

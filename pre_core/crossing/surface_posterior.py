@@ -17,6 +17,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from pre_core.arrays import FloatArray
 from pre_core.crossing import compliances, posterior, surrogate
+from pre_core.crossing.copula import copula_draws
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.mismatch import has_alike_tyres
 from pre_core.crossing.nuisances import (
@@ -106,8 +107,11 @@ def surface_posterior(found: Optimum, inflation: float, seed: int) -> SurfacePos
     wide = draw_curved(found, first.squares, POINTS, seed, widened, may_be_absent=False)
     if not is_enough(wide.worth, POINTS):
         return first._replace(points=_points_of_normal(found, POINTS, widened, seed))
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 23,)))
-    points = wide.y[importance.systematic_resample(wide.worth.weight, POINTS, rng)]
+    # Points that crossings have in common would have errors that add up in fusion.
+    own = (1 << 23, found.problem.noise.reciprocal.size)
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=own))
+    resampled = wide.y[importance.systematic_resample(wide.worth.weight, POINTS, rng)]
+    points = copula_draws(resampled, POINTS, rng)
     second = fitted(points[:POINTS_OF_DRAWS])
     return second._replace(points=points, evaluations=first.evaluations + second.evaluations)
 

@@ -10,7 +10,12 @@ from pre_core.arrays import FloatArray
 from pre_core.crossing import compliances, posterior
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.nuisances import place_of_offset
-from pre_core.crossing.response_surface import ResponseSurface, _fit_parabolas, residuals_of
+from pre_core.crossing.response_surface import (
+    ResponseSurface,
+    _fit_parabolas,
+    _root_of_squares,
+    residuals_of,
+)
 from pre_core.crossing.surface_posterior import (
     curved_coordinates,
     draw_curved,
@@ -100,13 +105,43 @@ def test_integrated_residuals_have_the_least_squares_of_all_residuals() -> None:
     assert np.std(seen - true) < 0.1 * np.std(true)
 
 
+def _some_columns(values: FloatArray, some: slice) -> FloatArray:
+    return values[:, some]
+
+
 def test_parabolas_are_found_again() -> None:
     rng = np.random.default_rng(2)
     u = rng.standard_normal((200, 4))
     first, second = np.triu_indices(4)
     true = rng.standard_normal((5, 1 + 4 + first.size))
     values = true @ np.column_stack([np.ones(200), u, u[:, first] * u[:, second]]).T
-    assert np.allclose(_fit_parabolas(u, lambda some: values[:, some]), true, atol=2e-3)
+    fitted, error = _fit_parabolas(u, partial(_some_columns, values))
+    assert np.allclose(fitted, true, atol=2e-3)
+    assert np.abs(error).max() < 1e-3
+
+
+def test_what_parabolas_do_not_follow_counts_as_no_knowledge() -> None:
+    """Of a remainder without parabolas the squares are zero on average, not those of a fit."""
+    rng = np.random.default_rng(8)
+    of_fits, corrected = [], []
+    for _ in range(40):
+        u = rng.standard_normal((100, 3))
+        values = rng.standard_normal((30, 100))
+        fitted, error = _fit_parabolas(u, partial(_some_columns, values))
+        of_fits.append(np.trace(fitted.T @ fitted))
+        corrected.append(of_fits[-1] - np.trace(error))
+    assert np.mean(of_fits) > 2.0
+    assert abs(np.mean(corrected)) < 0.05 * np.mean(of_fits)
+
+
+def test_squares_of_few_rows_are_those_of_all_less_their_error() -> None:
+    rng = np.random.default_rng(9)
+    columns, error = rng.standard_normal((40, 6)), np.diag([0.5, 1.0, 0.1])
+    few = _root_of_squares(columns, error)
+    squares = columns.T @ columns
+    squares[:3, :3] -= error
+    assert few.shape == (6, 6)
+    assert np.allclose(few.T @ few, squares)
 
 
 def drawn_surface(rng: np.random.Generator, moves: int) -> ResponseSurface:
