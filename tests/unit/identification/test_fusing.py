@@ -294,7 +294,7 @@ def test_the_command_fuses_files(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     empty = write(tmp_path / "empty.json", [])
     assert main(["fuse", str(empty)]) == 2
-    assert "no crossing that could be fused" in capsys.readouterr().err
+    assert "empty.json: holds no crossing; driveby identify --into" in capsys.readouterr().err
     live = crossing(1).model_copy(update={"realm": "live"})
     both = write(tmp_path / "both.json", [crossing(0), live])
     assert main(["fuse", str(both)]) == 2
