@@ -89,7 +89,7 @@ def response_surface(
     few = _root_of_squares(np.hstack([fitted, linear, waves]), error)
     n = of.kept.size
     ends = np.cumsum([1, n, fitted.shape[1] - 1 - n, linear.shape[1]])
-    constant, slopes, products, linear, waves = np.hsplit(few[: few.shape[1]], ends)
+    constant, slopes, products, linear, waves = np.hsplit(few, ends)
     return ResponseSurface(
         centre,
         size,
