@@ -295,6 +295,17 @@ def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFi
     empty = write(tmp_path / "empty.json", [])
     assert main(["fuse", str(empty)]) == 2
     assert "empty.json: holds no crossing; driveby identify --into" in capsys.readouterr().err
+    rejected = crossing(0).model_copy(
+        update={
+            "verdict": "rejected",
+            "reasons": (Reason.GAP_ON_BRIDGE,),
+            "reason_texts": ("A gap.",),
+            "parameters": None,
+            "fusion_likelihood": None,
+        }
+    )
+    assert main(["fuse", str(write(tmp_path / "rejected.json", [rejected]))]) == 2
+    assert "no crossing that could be fused" in capsys.readouterr().err
     live = crossing(1).model_copy(update={"realm": "live"})
     both = write(tmp_path / "both.json", [crossing(0), live])
     assert main(["fuse", str(both)]) == 2
