@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 
 _AFTER_FAILURE: Final = (
-    "do not rely on intervals of a pair that failed: check the site file, try another number of "
-    "elements or another truck, and validate again"
+    "do not rely on intervals of a pair that failed: check the site file, try fewer elements or "
+    "another truck, and validate again"
 )
 
 

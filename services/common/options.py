@@ -168,7 +168,7 @@ def id_option(default: str) -> Any:
     return opt(text, flags=("--id",), default=default)
 
 
-def noise_option(text: str, default: float = 0.0) -> Any:
+def noise_option(text: str, default: float | None = 0.0) -> Any:
     """Return `--noise` of the accelerometers."""
     return opt(text, number("a noise density", low=0, high=1e6), default=default)
 

@@ -45,6 +45,7 @@ from services.identification.bridge_state import (
 )
 from services.identification.methods import window_of
 from services.identification.outputs import FusionTask, IdentificationTask
+from services.identification.usable import latest_realms
 from services.recordings.mcap_ranges import ChunkIndexes, read_index
 from services.recordings.recording import is_being_written, read_info, read_messages
 from services.recordings.remote import LocalRecording, Recording, RemoteRecording, fetched
@@ -392,9 +393,10 @@ def _fused(
     fusing: FusionSettings,
     execution: CrossingExecutor,
 ) -> dict[str, BridgeResult]:
-    """Return the states of all bridges; of a bridge in several realms the last one."""
+    """Return the states of all bridges; of one in several realms that of the last crossing's."""
     states: dict[str, BridgeResult] = {}
-    for (realm, bridge), crossings in sorted(counted.items()):
+    for bridge, realm in sorted(latest_realms(counted).items()):
+        crossings = counted[realm, bridge]
         baseline = fusing.baselines.get(bridge)
         with_one = fusing._replace(baselines={} if baseline is None else {bridge: baseline})
         execution.submit_fusion(

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Sequence
 from functools import partial
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from schemas.results import BridgeResult, CrossingResult, ResultHeader, Results, results
 from schemas.settings import IdentificationSettings
@@ -17,6 +17,7 @@ from services.identification.bridge_state import (
     usable,
     with_common_shares,
 )
+from services.identification.usable import ONE_REALM
 from services.recordings.recording import program_version
 
 
@@ -26,11 +27,6 @@ class FusedElements(NamedTuple):
     id: str
     lengths_m: tuple[float, ...]
     nominal_flexural_rigidity_nm2: tuple[float, ...]
-
-
-_ONE_REALM: Final = (
-    "fuse one realm at a time (import --realm NAME files the drives of a campaign in one)"
-)
 
 
 class FusedResults(NamedTuple):
@@ -69,7 +65,7 @@ def crossings_to_fuse(name: str, files: Sequence[Results]) -> CrossingsToFuse:
     crossings = {c.crossing_id: c for one in ordered for c in one.crossings}
     realms = sorted({crossing.realm for crossing in crossings.values()})
     if len(realms) > 1:
-        raise InputError(f"{name}: crossings of {', '.join(realms)}; {_ONE_REALM}")
+        raise InputError(f"{name}: crossings of {', '.join(realms)}; {ONE_REALM}")
     repeated = sum(len(one.crossings) for one in ordered) - len(crossings)
     by_time = sorted(crossings.values(), key=lambda crossing: crossing.entry_time)
     return CrossingsToFuse(ordered[-1], tuple(by_time), repeated)

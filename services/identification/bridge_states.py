@@ -18,6 +18,7 @@ from services.identification.bridge_state import (
 )
 from services.identification.known import CrossingRecord
 from services.identification.outputs import FusionTask, IdentificationTask, Output, state_output
+from services.identification.usable import latest_realms
 from services.identification.waiting import PendingCrossing
 
 _log = logging.getLogger(__name__)
@@ -156,8 +157,13 @@ class BridgeStates:
                 yield self._fuse(name, bridge.counted.newest[-1].exit_time)
 
     def bridges(self) -> dict[str, BridgeResult]:
-        """Return the latest state of every bridge that has one, for the results file."""
-        states = {name: bridge.state for (_, name), bridge in self._of_bridge.items()}
+        """Return the latest state of every bridge that has one, for the results file.
+
+        Of a bridge in several realms it is that of the last crossing's realm, with a warning.
+        """
+        counted = {name: bridge.counted for name, bridge in self._of_bridge.items()}
+        latest = latest_realms(counted)
+        states = {name: self._at(realm, name).state for name, realm in latest.items()}
         return {name: state for name, state in states.items() if state is not None}
 
     def _fuse(self, name: Name, exit_time: float) -> FusionTask:

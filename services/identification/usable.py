@@ -3,13 +3,19 @@
 A logger uses them before it deletes a recording, so neither numba nor SciPy is imported.
 """
 
+import logging
 from bisect import insort
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import Final, NamedTuple
 
 from schemas.fusion import FusionLikelihood
 from schemas.results import CrossingResult, ElementState, RoadResult, Verdict
 
+_log = logging.getLogger(__name__)
+
+ONE_REALM: Final = (
+    "fuse one realm at a time (import --realm NAME files the drives of a campaign in one)"
+)
 LISTED_AT_MOST = 100
 """Maximum number of fused crossings, the newest, and of named excluded ones.
 
@@ -78,6 +84,27 @@ def add_crossings(
         del newest[: -LISTED_AT_MOST - 1]
         number += 1
     return RecentCrossings(tuple(newest), number)
+
+
+def latest_realms(counted: Mapping[tuple[str, str], RecentCrossings]) -> dict[str, str]:
+    """Return the realm of the last crossing of each bridge, by the bridge's name.
+
+    `counted` are the crossings by realm and bridge. Log a warning for each bridge with crossings in
+    several realms, which are not fused with each other.
+    """
+    realms: dict[str, list[str]] = {}
+    for (realm, bridge), crossings in counted.items():
+        if crossings.newest:
+            realms.setdefault(bridge, []).append(realm)
+    latest = {}
+    for bridge, some in realms.items():
+        last = max(some, key=lambda realm: counted[realm, bridge].newest[-1].entry_time)
+        latest[bridge] = last
+        if len(some) > 1:
+            listed = ", ".join(sorted(some))
+            text = "%s: crossings of %s, and only those of %s are fused; %s"
+            _log.warning(text, bridge, listed, last, ONE_REALM)
+    return latest
 
 
 def source_of(result: CrossingResult) -> Source | None:

@@ -116,7 +116,7 @@ def simulate(
     site: Name | Site | None = None,
     road: str | tuple[ArrayLike, ArrayLike] = "A",
     seed: int = 1,
-    noise: float = 0.0,
+    noise: float | None = None,
     speed: float | Sequence[float] | NDArray[Any] = 10.0,
     direction: str = "start_to_end",
     gps_noise: bool = False,
@@ -128,8 +128,9 @@ def simulate(
     12) or `ei` (n,), the ratio of each element's EI to its nominal value. `site` is by default that
     of the paper. `road` is an ISO 8608 class, A to E, or a profile under both axles: chainages from
     the start of the bridge and heights (n,) in m, level beyond its ends. `noise` is the
-    accelerometers' noise density in µg/√Hz; method pre needs some. `speed` is in m/s, or a pair
-    (start, end); `rate` in Hz is by default the site's. BLAS is limited to one thread meanwhile.
+    accelerometers' noise density in µg/√Hz, by default that of a given site, else 0; method pre
+    needs some. `speed` is in m/s, or a pair (start, end); `rate` in Hz is by default the site's.
+    BLAS is limited to one thread meanwhile.
 
     All drives begin at one time; crossings to be fused need others: `Simulation.started_at`.
 
@@ -143,8 +144,9 @@ def simulate(
     number_of = None if scenario is None else whole("scenario", scenario, 1, _SCENARIOS)
     ratios = None if ei is None else numbers("ei", ei, 1e-3, 1e3, _RATIOS)
     speeds = one_or_two("speed", speed, 0.1, 60, "(start, end)")
-    density = number("noise", noise, 0, 1e6)
     known = paper_site() if site is None else middle_site(given_site(site))
+    declared = 0.0 if site is None else known.sensor.noise_density_ug_per_rthz
+    density = declared if noise is None else number("noise", noise, 0, 1e6)
     with one_blas_thread():
         drive = simulate_drive(
             known,

@@ -181,6 +181,13 @@ def _latest_state(
     return max(states, key=moment) if states else None
 
 
+def _realm(state: BridgeResult | None, crossings: Sequence[CrossingResult]) -> str:
+    """Return the realm of the last crossing in the state, or of the last one; "" without any."""
+    used = () if state is None else state.crossings_used
+    own = [one for one in crossings if one.crossing_id in used] or crossings
+    return own[-1].realm if own else ""
+
+
 def _state_of_all(
     name: str, state: BridgeResult | None, crossings: Sequence[CrossingResult]
 ) -> BridgeResult | None:
@@ -213,7 +220,8 @@ def _one_by_one(
     """
     state = view.state
     left_out = set() if state is None else {one.crossing_id for one in state.crossings_left_out}
-    own = {one.crossing_id for one in crossings if one.realm == crossings[-1].realm}
+    realm = _realm(state, crossings)
+    own = {one.crossing_id for one in crossings if one.realm == realm}
     good = [
         one
         for one in view.crossings
@@ -364,7 +372,7 @@ def _quality(view: BridgeView, crossings: Sequence[CrossingResult], language: La
         f"{counts[v]} {language.text(v)}" for v in ("good", "suspect", "rejected") if counts[v]
     )
     parts = [language.choice("quality.count", len(crossings), verdicts=verdicts)]
-    campaigns = sorted({one.realm for one in crossings} - {crossings[-1].realm})
+    campaigns = sorted({one.realm for one in crossings} - {_realm(view.state, crossings)})
     if campaigns:
         number = sum(one.realm in campaigns for one in crossings)
         realms = ", ".join(campaigns)
@@ -409,7 +417,8 @@ def _excluded(
     view: BridgeView, crossings: Sequence[CrossingResult], language: Language
 ) -> Iterator[str]:
     """Yield how many crossings of the campaign are not in the numbers, and why."""
-    own = [one for one in crossings if one.realm == crossings[-1].realm]
+    realm = _realm(view.state, crossings)
+    own = [one for one in crossings if one.realm == realm]
     left_out = () if view.state is None else view.state.crossings_left_out
     verdicts = {one.crossing_id: one.verdict for one in own if one.crossing_id not in view.used}
     reasons = []

@@ -67,6 +67,8 @@ def _simulate_plane(
     console: "Console",
 ) -> int:
     ratios = ratios_of(known.bridges[0], asked.scenario, asked.ei)
+    declared = 0.0 if asked.site is None else known.sensor.noise_density_ug_per_rthz
+    noise = declared if asked.noise is None else asked.noise
     twist = twist_of(known.bridges[0], asked.lane_offset, asked.torsion)
     effects = effects_of(asked)._replace(twist=twist)
     paths = None if surface is None else wheel_paths_of(known.vehicles[0], surface)
@@ -80,7 +82,7 @@ def _simulate_plane(
                 ratios,
                 DrivenRoad(asked.road, asked.seed, paths),
                 Measurement(
-                    asked.noise,
+                    noise,
                     rate_hz=asked.rate,
                     has_receiver_errors=asked.gps_noise,
                     seed=(of_noise, number) if number else of_noise,
@@ -90,10 +92,8 @@ def _simulate_plane(
                 beyond=effects,
             )
             drives.append(drive)
-        declared = declared_site(known, asked.noise, drives[0].run.rate_hz)
-        messages = write_drives(
-            asked.output, drives, declared, force=asked.force, schedule=schedule
-        )
+        site = declared_site(known, noise, drives[0].run.rate_hz)
+        messages = write_drives(asked.output, drives, site, force=asked.force, schedule=schedule)
     times = drives[0].run.accel_time_s
     console.print(
         f"{asked.output}: {schedule.in_words()}{times[-1] - times[0]:.1f} s, {messages} messages",
@@ -140,7 +140,9 @@ def _with_tandem(asked: SimulateOptions, site: Site) -> Site | None:
         return site
     if asked.axles != 3:
         return None
-    tipper = usual_tandem(asked.noise, asked.tyres or "twin")
+    declared = 0.0 if asked.site is None else max(site.sensor.noise_density_ug_per_rthz)
+    noise = declared if asked.noise is None else asked.noise
+    tipper = usual_tandem(noise, asked.tyres or "twin")
     rate = max(site.sensor.rate_hz)
     sensors = tuple(one.model_copy(update={"rate_hz": rate}) for one in tipper.sensors)
     tipper = tipper.model_copy(update={"sensors": sensors})

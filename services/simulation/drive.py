@@ -35,7 +35,7 @@ from pre_core.physics.simulate import (
 )
 from pre_core.physics.vehicle import HalfCar, static_axle_loads_n
 from schemas.signals import CHANNELS
-from schemas.site import Bridge, Site, Vehicle
+from schemas.site import Bridge, Densities, Site, Vehicle
 from schemas.site_file import parse_site, site_toml
 from services.common.arrays import Floats
 from services.common.errors import FailureError, InputError
@@ -116,8 +116,8 @@ class DrivenRoad(NamedTuple):
 class Measurement(NamedTuple):
     """Accelerometers and receiver of a simulated drive."""
 
-    noise_ug_per_rthz: float = 0.0
-    """Noise density of every accelerometer."""
+    noise_ug_per_rthz: float | Densities = 0.0
+    """Noise density of every accelerometer, or of each channel."""
     rate_hz: float | None = None
     """Sampling rate of the accelerometers; None: the highest of the site."""
     has_receiver_errors: bool = False
@@ -147,14 +147,18 @@ def paper_site() -> Site:
     return parse_site(text, "paper.toml")
 
 
-def declared_site(
-    site: Site, noise_ug_per_rthz: float | tuple[float, float, float, float], rate_hz: float
-) -> Site:
+def densities_of(noise_ug_per_rthz: float | Densities) -> Densities:
+    """Return the noise density of each channel in µg/√Hz; one number is that of all four."""
+    if isinstance(noise_ug_per_rthz, float | int):
+        return (noise_ug_per_rthz,) * 4
+    return noise_ug_per_rthz
+
+
+def declared_site(site: Site, noise_ug_per_rthz: float | Densities, rate_hz: float) -> Site:
     """Return the site as the owner of this simulated truck would declare it, with sensor noise."""
-    alike = isinstance(noise_ug_per_rthz, float | int)
     sensor = site.sensor.model_copy(
         update={
-            "noise_density_ug_per_rthz": (noise_ug_per_rthz,) * 4 if alike else noise_ug_per_rthz,
+            "noise_density_ug_per_rthz": densities_of(noise_ug_per_rthz),
             "rate_hz": (rate_hz,) * 4,
         }
     )
@@ -223,7 +227,7 @@ def simulate_drive(
     sign = 1 if forward else -1
     start = -approach if forward else bridge.span_m + approach
     motion = constant_acceleration(start, sign * first_speed, acceleration, steps, step_s)
-    sensor = Accelerometer(rate, noise_density_ug_per_rthz=measurement.noise_ug_per_rthz)
+    densities = densities_of(measurement.noise_ug_per_rthz)
     run, roads = measured_run(
         bridge,
         car,
@@ -231,7 +235,7 @@ def simulate_drive(
         TimedMotion(motion, step_s, settle),
         road,
         Instruments(
-            (sensor,) * len(CHANNELS),
+            tuple(Accelerometer(rate, noise_density_ug_per_rthz=one) for one in densities),
             receiver_of(site, perfect=not measurement.has_receiver_errors),
             np.random.default_rng(road.seed if measurement.seed is None else measurement.seed),
             vehicle.gps_antenna_to_front_axle_m,
@@ -407,9 +411,10 @@ def ratios_of(
         ratios = np.array(ei or (), dtype=np.float64)
         option = "ei"
     if ratios.size != bridge.elements:
+        remedy = f": {prefix}ei takes one ratio for each" if scenario is not None else ""
         raise InputError(
             f"{prefix}{option}: gives {ratios.size} elements, but {bridge.id} of the site has "
-            f"{bridge.elements}"
+            f"{bridge.elements}{remedy}"
         )
     return ratios
 

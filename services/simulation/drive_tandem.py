@@ -11,6 +11,7 @@ from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from schemas.site import Bridge, Site, Vehicle
 from schemas.site_axle_tables import Axle
 from schemas.site_file import site_toml
+from schemas.site_sensors import PlacedSensor
 from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.common.progress import steps_bar
@@ -44,7 +45,8 @@ class TandemDrive(NamedTuple):
 
     road: tuple[str, int]
     """ISO 8608 class, and the seed of the surface."""
-    noise_ug_per_rthz: float = 0.0
+    noise_ug_per_rthz: float | None = 0.0
+    """Noise density of every sensor; None: those that the site declares."""
     speed_m_per_s: float = 10.0
     forward: bool = True
     has_receiver_errors: bool = False
@@ -93,7 +95,7 @@ def site_of_sensors(site: Site, how: TandemDrive) -> Site:
     sensors = tuple(
         one.model_copy(
             update={
-                "noise_density_ug_per_rthz": how.noise_ug_per_rthz,
+                "noise_density_ug_per_rthz": _density(one, how),
                 "rate_hz": how.rate_hz or one.rate_hz,
             }
         )
@@ -101,6 +103,11 @@ def site_of_sensors(site: Site, how: TandemDrive) -> Site:
     )
     declared = vehicle.model_copy(update={"sensors": sensors})
     return site.model_copy(update={"vehicles": (declared,), "ros2": ()})
+
+
+def _density(sensor: PlacedSensor, how: TandemDrive) -> float:
+    declared = sensor.noise_density_ug_per_rthz
+    return declared if how.noise_ug_per_rthz is None else how.noise_ug_per_rthz
 
 
 def tandem_case(site: Site, ratios: Floats, how: TandemDrive) -> WideCase:
@@ -130,7 +137,7 @@ def tandem_case(site: Site, ratios: Floats, how: TandemDrive) -> WideCase:
                 one.position_m or 0.0,
                 one.axle or 0,
                 one.lateral_m,
-                noise_ug_per_rthz=how.noise_ug_per_rthz,
+                noise_ug_per_rthz=_density(one, how),
             )
             for one in vehicle.sensors
         ),

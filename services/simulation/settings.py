@@ -69,7 +69,9 @@ class SimulateOptions:
     )
     road: str = opt("road class by ISO 8608 (default: A)", default="A", choices=tuple("ABCDE"))
     seed: int = seed_option()
-    noise: float = noise_option("accelerometers' noise density in µg/√Hz (default: 0)")
+    noise: float | None = noise_option(
+        "accelerometers' noise density in µg/√Hz (default: the site's, or 0)", default=None
+    )
     speed: tuple[float, float] = opt(
         "speed in m/s, or START:END for a constant acceleration (default: 10)",
         _speed_range,

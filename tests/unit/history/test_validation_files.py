@@ -45,7 +45,7 @@ def test_record_of_the_pair_decides(site: Site, tmp_path: Path) -> None:
     assert line == (
         "Site validation of truck-1 on this bridge FAILED: 12 of 12 simulated crossings were good, "
         "49 of 60 intervals contained the truth. Do not rely on the intervals: check the site "
-        "file, try another number of elements or another truck, and validate again."
+        "file, try fewer elements or another truck, and validate again."
     )
     (german,) = validation_notes(tmp_path, site, [PAIR], language_of("de"))
     assert "NICHT bestanden: 12 von 12 simulierten Überfahrten" in german

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from schemas.reasons import REASON_TEXTS, BridgeReason, Reason
-from schemas.results import Prior, Results, results_json
+from schemas.results import CrossingResult, Prior, Results, results_json
 from schemas.site import Site
 from schemas.site_file import site_toml
 from services.cli.identify import _fit_lines
@@ -317,10 +318,19 @@ def test_several_surveys_are_fused_and_other_campaigns_are_named(site: Site) -> 
     text = reported(site, *files).text
     assert "6 crossings: 6 good. The numbers below combine all 6;" in text
     assert f" {together.elements['EI_1'].mean / 1e9:.2f} " in text
-    other = tuple(one.model_copy(update={"realm": "sim-other"}) for one in surveys[0])
+    other = _in_realm(surveys[0], "sim-other")
     text = reported(site, files[0].model_copy(update={"crossings": other}), files[1]).text
     assert "3 of them are of another campaign (realm sim-other) and not in the numbers" in text
     assert "The numbers below combine 3 of them;" in text
+    # A results file whose state is that of the earlier campaign: the later one is another.
+    both = files[0].model_copy(update={"crossings": (*surveys[0], *_in_realm(surveys[1], "late"))})
+    text = reported(site, both).text
+    assert "3 of them are of another campaign (realm late) and not in the numbers" in text
+    assert "The numbers below combine 3 of them;" in text
+
+
+def _in_realm(crossings: Sequence[CrossingResult], realm: str) -> tuple[CrossingResult, ...]:
+    return tuple(one.model_copy(update={"realm": realm}) for one in crossings)
 
 
 @pytest.mark.usefixtures("drawn")

@@ -1,0 +1,55 @@
+"""Noise of simulated accelerometers: by `--noise`, else that which a given site declares."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from driveby import simulate
+from pre_core.constants import MICRO_G_M_PER_S2
+from schemas.signals import CHANNELS
+from schemas.site_file import site_toml
+from services.cli.main import main
+from services.execution.offline import site_of
+from services.simulation.drive import declared_site, paper_site
+
+RATE_HZ = 200.0
+DENSITIES = (10.0, 20.0, 30.0, 40.0)
+
+
+def test_channels_have_the_densities_of_the_site() -> None:
+    site = declared_site(paper_site(), DENSITIES, RATE_HZ)
+    noisy, quiet = (
+        simulate(scenario=6, site=site, speed=20.0, noise=noise).drive.run.channels
+        for noise in (None, 0.0)
+    )
+    errors = [np.std(noisy[name] - quiet[name]) for name in CHANNELS]
+    expected = np.array(DENSITIES) * MICRO_G_M_PER_S2 * np.sqrt(0.5 * RATE_HZ)
+    assert errors == pytest.approx(expected, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("options", "declared"),
+    [([], DENSITIES), (["--noise", "0"], (0.0,) * 4), (["--noise", "25"], (25.0,) * 4)],
+)
+def test_recording_declares_the_simulated_noise(
+    options: list[str], declared: tuple[float, ...], tmp_path: Path
+) -> None:
+    file, out = tmp_path / "site.toml", tmp_path / "drive.mcap"
+    file.write_text(site_toml(declared_site(paper_site(), DENSITIES, RATE_HZ)))
+    given = ["simulate", "--site", str(file), "--scenario", "6", "--speed", "20", *options]
+    assert main([*given, "-o", str(out)]) == 0
+    assert site_of([out], None).sensor.noise_density_ug_per_rthz == declared
+
+
+def test_truth_of_other_elements_names_the_option(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site = paper_site()
+    bridge = site.bridges[0].model_copy(update={"elements": 5})
+    file, out = tmp_path / "site.toml", tmp_path / "drive.mcap"
+    file.write_text(site_toml(site.model_copy(update={"bridges": (bridge,)})))
+    assert main(["simulate", "--site", str(file), "--scenario", "6", "-o", str(out)]) == 2
+    line = "gives 7 elements, but bridge-1 of the site has 5: --ei takes one ratio for each"
+    assert line in capsys.readouterr().err
+    assert not out.exists()
