@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pre_core.fusion.joint import mass_sensitivity
+from pre_core.fusion.mass import mass_sensitivity
 from schemas.fusion import FusionLikelihood
 from schemas.results import CrossingResult, Parameter, ResultHeader, Results, load_results, results
 from services.common.arrays import Floats

@@ -39,10 +39,10 @@ class CurvatureTerms(NamedTuple):
 
 
 def to_surface_coordinates(bends: CurvatureTerms, at: FloatArray) -> FloatArray:
-    """Return a bridge `at` (b,) in the coordinates (b,) of the linear part and the moves."""
+    """Return bridges `at` (…, b) in the coordinates (…, b) of the linear part and the moves."""
     coordinates = at.copy()
-    logs = slice(at.size - bends.logarithms, at.size)
-    coordinates[logs] = np.log(at[logs])
+    logs = slice(at.shape[-1] - bends.logarithms, at.shape[-1])
+    coordinates[..., logs] = np.log(at[..., logs])
     return coordinates
 
 
@@ -59,9 +59,11 @@ def linearise_with_curvature(
     of_bridge, of_others = root[:, :b], root[:, b : root.shape[1] - 1 - k]
     of_place, of_bends = root[:, -1 - k], root[:, root.shape[1] - k :]
     inverse = np.asarray(np.linalg.inv(bends.directions))
-    farthest = _FARTHEST if bends.logarithms else _FARTHEST_OF_DIFFERENCES
+    farthest = farthest_of(bends)
     about = to_surface_coordinates(bends, bends.about)
-    move, place = _within_reach(bends, inverse, to_surface_coordinates(bends, at) - about, farthest)
+    wanted = to_surface_coordinates(bends, at) - about
+    moves, places = _within_reach(bends, inverse, wanted[None, :], farthest)
+    move, place = moves[0], float(places[0])
     at = about + move
     size = float(np.linalg.norm(bends.directions[b]))
     others = cho_factor(of_others.T @ of_others + priors)
@@ -86,18 +88,139 @@ def linearise_with_curvature(
     return rows_at - np.outer(along, along @ rows_at), left - along * (along @ left)
 
 
+class CurvedForm(NamedTuple):
+    """Residuals (m,) at any bridge as `rows` times features, with the likeliest offset there.
+
+    The features (f,) are one, the bridge's coordinates (b,), and with terms the offset and the
+    terms (k,).
+    """
+
+    rows: FloatArray  # (m, f)
+    bends: CurvatureTerms | None
+    inverse: FloatArray
+    """Inverse (b + 1, b + 1) of the directions of moves."""
+    products: FloatArray
+    """Symmetric form (k, (b + 1)²) of each term."""
+    free: FloatArray
+    """Weight (f, f) of features where all else but the bridge is free."""
+
+    def features(self, at: FloatArray) -> FloatArray:
+        """Return the features (n, f) of bridges `at` (n, b)."""
+        if self.bends is None:
+            return np.column_stack([np.ones(at.shape[0]), at])
+        constant, slope, square = self._by_offset(at)
+        place = self._likeliest_offset(constant, slope, square)[:, None]
+        return constant + place * slope + place**2 * square
+
+    def along(self, at: FloatArray) -> FloatArray:
+        """Return the projection (m, m) of residuals that leaves out the offset at a bridge (b,)."""
+        unit = np.zeros(self.rows.shape[0])
+        if self.bends is not None:
+            constant, slope, square = self._by_offset(at[None, :])
+            place = self._likeliest_offset(constant, slope, square)[0]
+            unit = self.rows @ (slope[0] + 2.0 * place * square)
+            unit /= np.linalg.norm(unit)
+        return np.asarray(np.eye(unit.size) - np.outer(unit, unit))
+
+    def _by_offset(self, at: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return constant, slope (n, f) and square (f,) of the features as moves of the offset.
+
+        These are in addition to the offset of bridges `at` (n, b) within the terms' reach.
+        """
+        bends = self.bends
+        assert bends is not None  # noqa: S101 - the caller has looked
+        b, k = bends.about.size, bends.shapes.shape[0]
+        about = to_surface_coordinates(bends, bends.about)
+        wanted = to_surface_coordinates(bends, at) - about
+        moves, place = _within_reach(bends, self.inverse, wanted, farthest_of(bends))
+        # Beyond their reach the terms continue linearly in c.
+        beyond = wanted - moves
+        logs = slice(b - bends.logarithms, b)
+        beyond[:, logs] = np.expm1(beyond[:, logs])
+        unit = self.inverse[:, b]
+        sizes = moves @ self.inverse[:, :b].T + place[:, None] * unit
+        twice = sizes + 2.0 * (beyond @ self.inverse[:, :b].T)
+        forms = self.products.reshape(k, b + 1, b + 1)
+        outer = (sizes[:, :, None] * twice[:, None, :]).reshape(sizes.shape[0], -1)
+        constant = np.column_stack(
+            [np.ones(at.shape[0]), about + moves + beyond, place, outer @ self.products.T]
+        )
+        slope = np.zeros_like(constant)
+        slope[:, b + 1] = 1.0
+        slope[:, b + 2 :] = (sizes + twice) @ (forms @ unit).T
+        square = np.zeros(constant.shape[1])
+        square[b + 2 :] = forms @ unit @ unit
+        return constant, slope, square
+
+    def _likeliest_offset(
+        self, constant: FloatArray, slope: FloatArray, square: FloatArray
+    ) -> FloatArray:
+        """Return the move (n,) of the offset with the least squares."""
+        assert self.bends is not None  # noqa: S101 - the caller has looked
+        b = self.bends.about.size
+        size = float(np.linalg.norm(self.bends.directions[b]))
+        largest = farthest_of(self.bends) * size
+        of_slope, of_square = slope @ self.free, self.free @ square
+        first = np.sum(of_slope * constant, axis=1)
+        second = np.sum(of_slope * slope, axis=1)
+        bent, third, fourth = constant @ of_square, slope @ of_square, float(square @ of_square)
+        moved = np.zeros(constant.shape[0])
+        for _ in range(_PLACE_STEPS):
+            gradient = first + moved * (second + 2.0 * bent)
+            gradient += 3.0 * moved**2 * third + 2.0 * moved**3 * fourth
+            curvature = second + 4.0 * moved * third + 4.0 * moved**2 * fourth
+            moved = moved - np.clip(gradient / curvature, -size, size)
+            place = constant[:, b + 1]
+            moved = np.clip(place + moved, -largest, largest) - place
+        return np.asarray(moved)
+
+
+def curved_form(
+    of_bridge: FloatArray,
+    target: FloatArray,
+    of_terms: FloatArray,
+    bends: CurvatureTerms | None,
+    free: FloatArray,
+) -> CurvedForm:
+    """Return the residuals target - root x of a likelihood with all other coordinates zero.
+
+    `of_bridge` (m, b) and `of_terms` (m, 1 + k) are columns of its root; `free` (m, m) takes from
+    residuals what all others explain, which determines the offset.
+    """
+    rows = np.column_stack([target, -of_bridge, -of_terms])
+    if bends is None:
+        return CurvedForm(rows, None, np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)))
+    moves = bends.about.size + 1
+    first, second = np.triu_indices(moves)
+    forms = np.zeros((bends.shapes.shape[0], moves, moves))
+    forms[:, first, second] += 0.5 * bends.shapes
+    forms[:, second, first] += 0.5 * bends.shapes
+    return CurvedForm(
+        rows,
+        bends,
+        np.asarray(np.linalg.inv(bends.directions)),
+        forms.reshape(forms.shape[0], -1),
+        rows.T @ free @ rows,
+    )
+
+
+def farthest_of(bends: CurvatureTerms) -> float:
+    """Return the largest size of a move at which the terms apply."""
+    return _FARTHEST if bends.logarithms else _FARTHEST_OF_DIFFERENCES
+
+
 def _within_reach(
     bends: CurvatureTerms, inverse: FloatArray, move: FloatArray, farthest: float
-) -> tuple[FloatArray, float]:
-    """Return the `move` (b,) as far as the terms apply, and the likeliest offset there.
+) -> tuple[FloatArray, FloatArray]:
+    """Return moves (n, b) as far as the terms apply, and the likeliest offsets (n,) there.
 
     `inverse` is that of the directions, `farthest` the largest size of a move.
     """
     b = bends.about.size
-    sizes, place = inverse[:, :b] @ move, inverse[:, b]
-    sizes -= place * (place @ sizes) / (place @ place)
-    moved = bends.directions @ np.clip(sizes, -farthest, farthest)
-    return moved[:b], float(moved[b])
+    sizes, place = move @ inverse[:, :b].T, inverse[:, b]
+    sizes -= np.outer(sizes @ place, place) / (place @ place)
+    moved = np.clip(sizes, -farthest, farthest) @ bends.directions.T
+    return moved[:, :b], moved[:, b]
 
 
 def _bent(

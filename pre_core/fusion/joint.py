@@ -19,6 +19,7 @@ import numpy as np
 
 from pre_core.arrays import FloatArray
 from pre_core.crossing.compliances import CompliancePosterior, draws, from_normal, marginal
+from pre_core.fusion.curved_posterior import CurvedSum, curved_draws, curved_sum
 from pre_core.fusion.information import (
     BridgePriors,
     CrossingInformation,
@@ -26,6 +27,7 @@ from pre_core.fusion.information import (
     JointLayout,
 )
 from pre_core.fusion.likelihood import CrossingLikelihood, add_covariance, linearised_likelihood
+from pre_core.fusion.mass import mass_sensitivity
 from pre_core.fusion.path_groups import (
     FusionInput,
     PathGroup,
@@ -33,11 +35,14 @@ from pre_core.fusion.path_groups import (
     SharedMismatch,
     path_group_key,
     path_groups,
+    wave_precision,
 )
 from pre_core.fusion.variability import (
     VariabilityPosterior,
+    draws_of_tau,
     is_consistent_with_zero,
     marginalise_variability,
+    mean_variability,
     tau_draws,
     variability_posterior,
     varying_bridge,
@@ -67,6 +72,7 @@ class FusedDraws(NamedTuple):
 
 
 def sample_joint(
+    parts: Sequence[FusionInput],
     information: JointInformation,
     priors: BridgePriors,
     count: int,
@@ -74,9 +80,20 @@ def sample_joint(
     report: Report = lambda stage, fraction: None,
     threads: int = 1,
 ) -> FusedDraws:
-    """Return draws of a bridge, `count` of each chain; they do not depend on `threads`."""
+    """Return draws of a bridge, `count` of each chain; they do not depend on `threads`.
+
+    `parts` are the crossings in `information`. On surfaces the bridge varies by the root mean
+    square of tau.
+    """
     between = variability_posterior(information, priors)
-    drawn = _draw_bridge(information, priors, between, count, seed, report, threads)
+    curved = [one.likelihood.bends for one in parts if one.likelihood.bends is not None]
+    if any(bends.logarithms for bends in curved):
+        parts = sorted(parts, key=lambda part: part.name)
+        usual = mean_variability(between)
+        of = curved_sum(parts, path_groups(parts), information, priors, usual)
+        drawn = _draw_curved(of, priors, between, count, seed, report, threads)
+    else:
+        drawn = _draw_bridge(information, priors, between, count, seed, report, threads)
     return FusedDraws(*drawn, is_consistent_with_zero(between), information.shared)
 
 
@@ -181,9 +198,7 @@ def _linearised_about(
     if of.bends is None:
         return part
     at = of.bends.about if bridge is None else bridge
-    return part._replace(
-        likelihood=linearised_likelihood(of, at, tracks[path_group_key(part)].whole)
-    )
+    return part._replace(likelihood=linearised_likelihood(of, at, wave_precision(part, tracks)))
 
 
 def _layout_of(
@@ -243,13 +258,22 @@ def add_mass_parameter(
     return root.T @ root, root.T @ crossing.target
 
 
-def mass_sensitivity(priors: BridgePriors, centre: FloatArray) -> FloatArray:
-    """Return the derivative (b,) of the bridge's coordinates at `centre` (b,) by ln of the mass."""
-    of, power = priors.coordinates, priors.mass_powers
-    change = np.where(of.is_log, power / of.scale, power * centre)
-    elements = np.arange(centre.size - priors.elements, centre.size)
-    change[elements] = -power[elements] * centre[elements]
-    return np.asarray(change)
+def _draw_curved(
+    of: CurvedSum,
+    priors: BridgePriors,
+    between: VariabilityPosterior,
+    count: int,
+    seed: int,
+    report: Report,
+    threads: int,
+) -> tuple[FloatArray, FloatArray]:
+    """Return draws as `_draw_bridge`, of the crossings' surfaces."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 22,)))
+    progress = partial(report, "drawing the bridge")
+    drawn = curved_draws(of, priors, count * CHAINS, rng, progress, threads)
+    order = rng.permutation(count * CHAINS)
+    taus = draws_of_tau(between, count * CHAINS, rng)
+    return drawn[order].reshape(count, CHAINS, -1), taus.reshape(count, CHAINS)
 
 
 def _draw_bridge(

@@ -5,7 +5,7 @@ from the footprints and the lateral wander of the runs, which the residuals befo
 bridge determine.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -143,6 +143,12 @@ def path_group_key(part: FusionInput) -> PathGroupKey:
     spacing = float(knots_m[1] - knots_m[0]) if knots_m.size else 1.0
     first = round(float(knots_m[0]) / spacing) if knots_m.size else 0
     return PathGroupKey(part.truck, part.direction, first, knots_m.size, round(1e3 * spacing))
+
+
+def wave_precision(part: FusionInput, groups: Mapping[PathGroupKey, PathGroup]) -> FloatArray:
+    """Return the precision (q, q) of a crossing's long waves, own and shared parts together."""
+    group = groups.get(path_group_key(part))
+    return np.zeros((0, 0)) if group is None else group.whole
 
 
 def low_rank_root(covariance: FloatArray) -> FloatArray:

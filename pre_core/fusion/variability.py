@@ -93,8 +93,7 @@ def marginalise_variability(
         return bridge.precision, bridge.linear, 0.0
     elements = information.layout.elements
     e = elements.size
-    root = np.linalg.cholesky((1.0 - rho) * np.eye(e) + rho) * tau
-    root = information.centre[elements][:, None] * root
+    root = information.centre[elements][:, None] * change_root(e, tau, rho)
     precision, linear, evidence = bridge.precision.copy(), bridge.linear.copy(), 0.0
     for some in bridge.alike:
         across = root.T @ some.across
@@ -107,6 +106,12 @@ def marginalise_variability(
         precision[np.ix_(some.places, some.places)] -= rows[:, :-1].T @ rows[:, :-1]
         linear[some.places] -= rows[:, :-1].T @ rows[:, -1]
     return precision, linear, evidence
+
+
+def change_root(elements: int, tau: float, rho: float) -> FloatArray:
+    """Return a root (e, e) of the covariance of the elements' relative changes."""
+    covariance = (1.0 - rho) * np.eye(elements) + rho
+    return np.asarray(np.linalg.cholesky(covariance) * tau)
 
 
 def variability_posterior(
@@ -155,6 +160,23 @@ def is_consistent_with_zero(between: VariabilityPosterior) -> bool:
 def _edges() -> FloatArray:
     """Return the boundaries between the grid cells of tau."""
     return np.concatenate([[0.0], 0.5 * (_TAUS[1:] + _TAUS[:-1]), [_TAUS[-1]]])
+
+
+def mean_variability(between: VariabilityPosterior) -> tuple[float, float]:
+    """Return the root of the mean square of tau, and the mean share rho of those squares."""
+    tau_squared = np.sum(between.within * between.fine[_cells(between)] ** 2, axis=1)
+    total = float(np.sum(tau_squared))
+    return float(np.sqrt(total)), float(tau_squared @ between.rho) / total
+
+
+def draws_of_tau(between: VariabilityPosterior, count: int, rng: np.random.Generator) -> FloatArray:
+    """Return draws (count,) of tau."""
+    fine = between.fine[_cells(between)]
+    return np.asarray(rng.choice(fine.ravel(), count, p=between.within.ravel()))
+
+
+def _cells(between: VariabilityPosterior) -> NDArray[np.int64]:
+    return np.arange(between.tau.size) // len(_RHOS)
 
 
 def tau_draws(

@@ -172,7 +172,7 @@ def fused(
     def drawing(stage: str, fraction: float) -> None:
         report(stage, _JOINED + (1.0 - _JOINED) * fraction)
 
-    found = sample_joint(information, priors, _DRAWS_PER_CHAIN, _SEED, drawing, threads)
+    found = sample_joint(parts, information, priors, _DRAWS_PER_CHAIN, _SEED, drawing, threads)
     nominal = priors.coordinates.location[-priors.elements :]
     spread = priors.coordinates.scale[-priors.elements :]
     y = found.draws.reshape(-1, found.draws.shape[2])[:, -priors.elements :]

@@ -58,7 +58,7 @@ FRONT, REAR = TYPICAL_FOOTPRINTS
 
 
 def fuse(parts: list[FusionInput], priors: BridgePriors, count: int, seed: int) -> FusedDraws:
-    return sample_joint(build_joint(parts, priors), priors, count, seed)
+    return sample_joint(parts, build_joint(parts, priors), priors, count, seed)
 
 
 def whole() -> mm.Mismatch:

@@ -1,0 +1,202 @@
+"""Posterior of a bridge on the surfaces of its crossings, without a common linearisation.
+
+Where crossings determine elements poorly, the widths of a normal about the most likely bridge are
+those of that bridge: it has no springs, and its ends are known better than those of the true one.
+A bridge with springs may be as likely and far away. So the bridge is drawn (`search.tempering`) by
+the likelihoods of all crossings at the drawn bridge itself. What is nearly linear there is
+integrated out: trucks, waves of the mismatch, changes of the bridge, and each crossing's offset.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from pre_core.arrays import FloatArray
+from pre_core.crossing.compliances import marginal
+from pre_core.fusion.curvature import CurvedForm, curved_form
+from pre_core.fusion.information import BridgePriors, JointInformation
+from pre_core.fusion.likelihood import linearised_likelihood
+from pre_core.fusion.mass import mass_sensitivity
+from pre_core.fusion.path_groups import (
+    FusionInput,
+    PathGroup,
+    PathGroupKey,
+    path_group_key,
+    wave_precision,
+)
+from pre_core.fusion.variability import change_root, marginalise_variability, varying_bridge
+from pre_core.search import tempering
+
+_WIDENED = 3.0
+"""Width of the normal from which draws begin, relative to that about the most likely bridge."""
+_SNAPSHOTS = 2
+
+
+class _CurvedCrossing(NamedTuple):
+    """A crossing's squares, with its own normal variables integrated out, as forms of features."""
+
+    form: CurvedForm
+    squares: FloatArray  # (f, f)
+    pull: FloatArray  # (f, s) on shared variables
+    precision: FloatArray  # (s, s) of these
+    places: NDArray[np.int64]
+    """Indices (s,) of these among all shared ones."""
+
+
+class CurvedSum(NamedTuple):
+    """All crossings of a bridge, with all that is nearly linear integrated out."""
+
+    crossings: tuple[_CurvedCrossing, ...]
+    factor: tuple[FloatArray, bool]
+    """Cholesky factor of the precision of all shared variables."""
+    sigma: FloatArray  # (e,) spread of ln EI
+    mean: FloatArray  # (b,) the most likely bridge y
+    covariance: FloatArray
+    """Covariance (b, b) of a normal wider than the one about it, from which draws begin."""
+
+    def log_posterior(self, y: FloatArray, pool: ThreadPoolExecutor) -> FloatArray:
+        """Return the log posterior (k,) of bridges y (k, b), up to a constant."""
+        e = self.sigma.size
+        x = y.copy()
+        x[:, -e:] = np.exp(-self.sigma * y[:, -e:])
+        squares = np.sum(y * y, axis=1)
+        pull = np.zeros((y.shape[0], self.factor[0].shape[0]))
+        of_each = pool.map(partial(_squares_and_pull, x), self.crossings)
+        for one, (of_squares, of_pull) in zip(self.crossings, of_each, strict=True):
+            squares += of_squares
+            pull[:, one.places] += of_pull
+        squares -= np.sum(pull * cho_solve(self.factor, pull.T).T, axis=1)
+        return np.asarray(-0.5 * squares)
+
+
+def _squares_and_pull(x: FloatArray, of: _CurvedCrossing) -> tuple[FloatArray, FloatArray]:
+    """Return a crossing's squares (k,) and pull (k, s) on shared variables at bridges x (k, b)."""
+    features = of.form.features(x)
+    return np.sum((features @ of.squares) * features, axis=1), features @ of.pull
+
+
+def curved_sum(
+    parts: Sequence[FusionInput],
+    tracks: Mapping[PathGroupKey, PathGroup],
+    information: JointInformation,
+    priors: BridgePriors,
+    variability: tuple[float, float],
+) -> CurvedSum:
+    """Return the crossings in `information`, of a bridge that varies by (tau, rho)."""
+    layout = information.layout
+    crossings = tuple(
+        _curved_crossing(part, tracks, information, priors, variability) for part in parts
+    )
+    precision = information.prior[layout.bridge :, layout.bridge :].copy()
+    for one in crossings:
+        precision[np.ix_(one.places, one.places)] += one.precision
+    sigma = priors.coordinates.scale[layout.elements]
+    mean, slope = information.centre.copy(), np.ones(layout.bridge)
+    mean[layout.elements] = -np.log(mean[layout.elements]) / sigma
+    slope[layout.elements] = -sigma * information.centre[layout.elements]
+    near = marginalise_variability(information, varying_bridge(information), *variability)
+    of_bridge = marginal(*near[:2], np.arange(mean.size))[0] * np.outer(slope, slope)
+    covariance = np.asarray(_WIDENED**2 * np.linalg.inv(of_bridge + np.eye(mean.size)))
+    return CurvedSum(crossings, cho_factor(precision), sigma, mean, covariance)
+
+
+def _curved_crossing(
+    part: FusionInput,
+    tracks: Mapping[PathGroupKey, PathGroup],
+    information: JointInformation,
+    priors: BridgePriors,
+    variability: tuple[float, float],
+) -> _CurvedCrossing:
+    of, layout, centre = part.likelihood, information.layout, information.centre
+    b, t, q = layout.bridge, len(of.truck.names), of.knots_m.size
+    key = path_group_key(part)
+    track = tracks.get(key)
+    whole = wave_precision(part, tracks)
+    near = linearised_likelihood(of, centre, whole)
+    m = near.target.size
+    others = of.root[:, b : b + t + q]
+    of_priors = np.eye(t + q)
+    of_priors[t:, t:] = whole
+    free = np.eye(m) - others @ np.linalg.solve(others.T @ others + of_priors, others.T)
+    form = curved_form(of.root[:, :b], of.target, of.root[:, b + t + q :], of.bends, free)
+    of_bridge, of_truck, of_waves = np.hsplit(near.root[:, : b + t + q], [b, b + t])
+    changes = of_bridge[:, layout.elements] * centre[layout.elements]
+    own = [changes @ change_root(priors.elements, *variability)]
+    heavier = of_bridge @ (part.mass_spread * mass_sensitivity(priors, centre))
+    shared = [of_truck, heavier[:, None]]
+    places = [layout.trucks[part.truck]]
+    if track is not None:
+        own.append(of_waves @ track.own_root)
+        if part.name in track.short_roots:
+            own.append(of_bridge @ track.short_roots[part.name])
+        if key in layout.tracks:
+            shared.append(of_waves)
+            places.append(layout.tracks[key])
+    noise = np.hstack(own)
+    weight = np.asarray(np.linalg.inv(np.eye(m) + noise @ noise.T))
+    along = form.along(centre)
+    weight = np.asarray(along @ weight @ along)
+    effects = np.hstack(shared)
+    return _CurvedCrossing(
+        form,
+        form.rows.T @ weight @ form.rows,
+        form.rows.T @ weight @ effects,
+        effects.T @ weight @ effects,
+        np.concatenate(places) - b,
+    )
+
+
+def curved_draws(
+    of: CurvedSum,
+    priors: BridgePriors,
+    count: int,
+    rng: np.random.Generator,
+    progress: Callable[[float], object] = lambda done: None,
+    threads: int = 1,
+) -> FloatArray:
+    """Return draws y (count, b) of the bridge's coordinates; they do not depend on `threads`."""
+    latent = _Latent(np.flatnonzero(~priors.coordinates.is_log), priors.log_odds)
+
+    each = -(-count // _SNAPSHOTS)
+    with ThreadPoolExecutor(threads) as pool:
+
+        def log_posterior(v: FloatArray) -> FloatArray:
+            found = of.log_posterior(latent.values(v), pool) + latent.log_share(v)
+            return np.where(np.isfinite(found), found, -np.inf)
+
+        drawn = tempering.tempered_draws(
+            log_posterior, of.mean, of.covariance, each, _SNAPSHOTS, rng, progress
+        )
+    return latent.values(drawn[:count])
+
+
+class _Latent(NamedTuple):
+    """Normal coordinates v of values y that must not be negative and may be exactly zero.
+
+    Zero is any v below zero; a value that is never zero is that of v and -v.
+    """
+
+    places: NDArray[np.int64]
+    log_odds: FloatArray  # (b,) of zero, against the density per unit
+
+    def values(self, v: FloatArray) -> FloatArray:
+        """Return the values (k, b) of coordinates v (k, b)."""
+        y, some = v.copy(), v[:, self.places]
+        odds = self.log_odds[self.places]
+        y[:, self.places] = np.where(
+            np.isneginf(odds), np.abs(some), np.where(np.isposinf(odds), 0.0, np.maximum(some, 0.0))
+        )
+        return y
+
+    def log_share(self, v: FloatArray) -> FloatArray:
+        """Return the log density (k,) of v (k, b) relative to that of the values."""
+        some, odds = v[:, self.places], self.log_odds[self.places]
+        # Without any chance of another value, v has a density of its own.
+        mass = np.where(np.isfinite(odds), odds + 0.5 * np.log(2.0 / np.pi), 0.0)
+        is_zero = np.isposinf(odds) | ((some <= 0.0) & ~np.isneginf(odds))
+        return np.asarray(np.sum(np.where(is_zero, mass - 0.5 * some**2, 0.0), axis=1))
