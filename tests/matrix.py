@@ -61,6 +61,8 @@ READS_SOURCES = (
     "tests/unit/execution/test_processes.py::test_no_process_outlives_its_parent",
     "tests/unit/history/test_bridge_history.py::test_view_opens_the_viewer_with_what_was_asked_for",
     "tests/unit/history/test_draws.py",
+    "tests/unit/identification/test_footprints.py",
+    "tests/unit/identification/test_inputs_of_spans.py",
     "tests/unit/identification/test_tandem_signals.py",
 )
 """Tests that need sources or studies as they lie in a checkout, or ArviZ."""

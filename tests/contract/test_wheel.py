@@ -1,5 +1,6 @@
 """An installed wheel brings one name, `driveby`, and lives beside other people's packages."""
 
+import ast
 import email
 import json
 import os
@@ -17,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from tests import matrix
 from tests.builders.wheels import INNER, distribution
 
 LARGEST_TRUCK_MB = 120.0
@@ -78,6 +80,36 @@ def test_the_wheel_holds_one_package(wheel: Path) -> None:
 def test_tests_can_be_run_against_the_wheel(built: dict[str, Any], project: Path) -> None:
     for path in (project / "tests").rglob("*.py"):
         built["moved_inside"](path.read_bytes(), str(path))
+
+
+def test_tests_of_the_matrix_import_no_studies(project: Path) -> None:
+    """Not even through other tests: `make matrix` copies no studies beside them."""
+    found = [path for name in matrix.SELECTION for path in tests_below(project / name)]
+    waiting = {path for path in found if str(path.relative_to(project)) not in matrix.READS_SOURCES}
+    seen: set[Path] = set()
+    while waiting:
+        path = waiting.pop()
+        seen.add(path)
+        modules = modules_imported_by(path)
+        assert not {one for one in modules if one.partition(".")[0] == "studies"}, path
+        places = {project / f"{module.replace('.', '/')}.py" for module in modules}
+        waiting |= {place for place in places if place.is_file() and "tests" in place.parts} - seen
+    assert len(seen) > 50
+
+
+def tests_below(path: Path) -> list[Path]:
+    return [path] if path.is_file() else sorted(path.rglob("test_*.py"))
+
+
+def modules_imported_by(path: Path) -> set[str]:
+    """Return the modules that a file imports when it is imported, and what it takes from each."""
+    names = set()
+    for node in ast.parse(path.read_bytes()).body:
+        if isinstance(node, ast.Import):
+            names |= {one.name for one in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module, *(f"{node.module}.{one.name}" for one in node.names)}
+    return names
 
 
 @pytest.fixture(scope="module")
