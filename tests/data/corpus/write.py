@@ -69,24 +69,34 @@ def write(source: Path, out: Path) -> None:
     results = results_of(site)
     (out / "results.json").write_text(results.model_dump_json(indent=1))
     with contextlib.suppress(ModuleNotFoundError):
-        archive = import_module("services.history.archive")
+        archive = first("services.history.history_store", "services.history.archive")
         archive.add_results(out / "history", results, {results.crossings[0].crossing_id: 9.5})
     with contextlib.suppress(ModuleNotFoundError):
-        store = import_module("services.execution.kept")
-        header = store.Header(
-            results.version, results.created, results.site_hash, results.settings, results.seed
-        )
-        (out / "into").mkdir()
-        found = [store.Result("0" * 64, results.crossings[0])]
-        store.Kept(out / "into").put(found, header)
+        write_folder(out / "into", results)
     with contextlib.suppress(ModuleNotFoundError):
-        catalog = import_module("services.history.catalog")
+        catalog = first("services.catalogue.index", "services.history.catalog")
+        update = getattr(catalog, "update_catalog", None) or catalog.mend
         stores = import_module("services.common.stores")
-        catalog.mend(stores.folder_at(str(out)))
+        update(stores.folder_at(str(out)))
     for path in (out / "drive.mcap", out / "results.json"):
         path.with_name(f"{path.name}.gz").write_bytes(gzip.compress(path.read_bytes(), mtime=0))
         path.unlink()
     (out / "spool" / "lock").unlink()
+
+
+def write_folder(into: Path, results: Any) -> None:
+    """Write a folder of results by the names that the commit has for store, result and header."""
+    store = first("services.execution.result_store", "services.execution.kept")
+    if hasattr(store, "ResultStore"):
+        kept, result = store.ResultStore, store.StoredResult
+        header = import_module("schemas.results").ResultHeader
+    else:
+        kept, result, header = store.Kept, store.Result, store.Header
+    into.mkdir()
+    head = header(
+        results.version, results.created, results.site_hash, results.settings, results.seed
+    )
+    kept(into).put([result("0" * 64, results.crossings[0])], head)
 
 
 def results_of(site: Any) -> Any:
