@@ -116,33 +116,37 @@ def index_messages(name: str, read: Read, site: Site) -> MessageIndex:
     for stream, what in (("accel", "accelerations (accel)"), ("gnss", "positions (gnss)")):
         if stream not in seen:
             raise InputError(f"{name}: no {what}, a recording of a truck is expected")
+    repeated.warn()
     order = {truck: _ranks(*two) for truck, two in made.items()}
     return MessageIndex(name, read, order, infos, near, {vehicle for _, vehicle in made})
 
 
 class _RepeatedStarts:
-    """Warning of two drives of a truck with one start, of which only the first counts."""
+    """Warning of drives of a truck with one start, of which only the first counts."""
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._checksums: dict[tuple[Key, int, int], int] = {}
-        self._warned: set[_Truck] = set()
+        self._checksums: dict[tuple[Key, int, int], set[int]] = {}
 
     def check(self, message: Message) -> None:
-        """Warn once for each truck where a sequence number of a boot has two contents."""
-        if message.sequence >= _COMPARED:
-            return
-        identity = (message.key, message.boot_id, message.sequence)
-        checksum = zlib.crc32(message.payload)
-        truck = _truck(message.key)
-        if self._checksums.setdefault(identity, checksum) == checksum or truck in self._warned:
-            return
-        self._warned.add(truck)
-        _log.warning(
-            "%s: %s has two drives with the same start; only the first one counts "
-            "(driveby simulate --start gives another start)",
-            *(self._name, message.key.identifier),
-        )
+        """Note the content of a sequence number of a boot: each drive has another one."""
+        if message.sequence < _COMPARED:
+            identity = (message.key, message.boot_id, message.sequence)
+            self._checksums.setdefault(identity, set()).add(zlib.crc32(message.payload))
+
+    def warn(self) -> None:
+        """Warn once for each truck, with the number of its drives."""
+        drives: dict[_Truck, int] = {}
+        for (key, _, _), contents in self._checksums.items():
+            truck = _truck(key)
+            drives[truck] = max(drives.get(truck, 1), len(contents))
+        for (_, vehicle), number in drives.items():
+            if number > 1:
+                _log.warning(
+                    "%s: %s has %d drives with the same start; only the first one counts "
+                    "(driveby simulate --start gives another start)",
+                    *(self._name, vehicle, number),
+                )
 
 
 def in_measurement_order(overview: MessageIndex) -> Iterator[Message]:

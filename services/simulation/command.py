@@ -96,7 +96,7 @@ def _simulate_plane(
         messages = write_drives(asked.output, drives, site, force=asked.force, schedule=schedule)
     times = drives[0].run.accel_time_s
     console.print(
-        f"{asked.output}: {schedule.in_words()}{times[-1] - times[0]:.1f} s, {messages} messages",
+        f"{asked.output}: {schedule.in_words(times[-1] - times[0])}, {messages} messages",
         highlight=False,
     )
     return 0

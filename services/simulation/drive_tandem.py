@@ -83,7 +83,7 @@ def simulate_tandem(
     )
     times = runs[0].accel_time_s
     console.print(
-        f"{output}: {how.schedule.in_words()}{times[-1] - times[0]:.1f} s, {messages} messages",
+        f"{output}: {how.schedule.in_words(times[-1] - times[0])}, {messages} messages",
         highlight=False,
     )
     return 0

@@ -3,6 +3,7 @@
 from typing import Final, NamedTuple
 
 from services.common.errors import InputError
+from services.common.language import utc_second
 from services.drives.runs import Run
 from services.simulation.positions import START_TIME_S
 
@@ -35,10 +36,11 @@ class Schedule(NamedTuple):
         day, run = divmod(number, self.runs)
         return start_s + day * _DAY_S + run * BETWEEN_RUNS_S
 
-    def in_words(self) -> str:
-        """Return what precedes the duration of a drive in the printed line."""
+    def in_words(self, duration_s: float) -> str:
+        """Return the drives in words, each of this duration, with the start of the first."""
         runs = "" if self.runs == 1 else f"{self.runs} runs of "
-        return runs if self.days == 1 else f"{self.days} days, {runs}"
+        days = "" if self.days == 1 else f"{self.days} days, "
+        return f"{days}{runs}{duration_s:.1f} s, from {utc_second(self.begin_s(0))} UTC"
 
 
 ONCE: Final = Schedule()

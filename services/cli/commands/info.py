@@ -258,6 +258,8 @@ def _print_table(found: "list[RecordingSummary]", unreadable: dict[Path, str]) -
         print("  ".join([*aligned, name]))
     for path, error in unreadable.items():
         print(f"{path}: {error}")
+    for line in _same_starts(found):
+        print(line)
     trucks = {truck.vehicle for one in found for truck in one.trucks}
     crossings = _number_of_crossings(found)
     counts = [
@@ -267,6 +269,21 @@ def _print_table(found: "list[RecordingSummary]", unreadable: dict[Path, str]) -
         count_of(crossings, "crossing"),
     ]
     print(", ".join(counts))
+
+
+def _same_starts(found: "list[RecordingSummary]") -> Iterator[str]:
+    """Yield a line for each truck whose recordings differ and begin at the same time."""
+    sizes: dict[tuple[str, str, int], Counter[int]] = {}
+    for one in found:
+        for truck in one.trucks:
+            name = (truck.realm, truck.vehicle, truck.first_ns)
+            sizes.setdefault(name, Counter())[one.size_bytes] += 1
+    for (_, vehicle, first_ns), of in sizes.items():
+        if len(of) > 1:
+            yield (
+                f"{vehicle}: {of.total()} recordings start at {_day(first_ns)} {_time(first_ns)}; "
+                "if they are different drives, identify counts only the first one"
+            )
 
 
 def _number_of_crossings(found: "list[RecordingSummary]") -> int:

@@ -76,6 +76,21 @@ def test_crossing_continued_in_the_next_file_counts_once(
     assert out.splitlines()[-1].endswith(", 1 truck, 1 crossing")
 
 
+def test_drives_of_one_start_are_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """As of simulations without --start: identify counts the first only."""
+    for name, left_out in (("one", range(0)), ("two", range(100, 130)), ("three", range(90, 130))):
+        sent = drive(leave_out=left_out)
+        write_recording(tmp_path / f"{name}.mcap", sent, site_toml=None, reason="test")
+    later = drive("truck-2", begin_s=100.0)
+    write_recording(tmp_path / "later.mcap", later, site_toml=None, reason="test")
+    _, out, _ = run(capsys, "info", tmp_path)
+    assert out.splitlines()[-2] == (
+        "truck-1: 3 recordings start at 2023-11-14 22:13:20.0; if they are different drives, "
+        "identify counts only the first one"
+    )
+    assert "truck-2: " not in out
+
+
 def test_json_holds_all_fields(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
     code, out, _ = run(capsys, "info", folder, "--json")
     assert code == 0

@@ -153,12 +153,19 @@ def test_what_is_no_drive(sent: list[Message], output: str) -> None:
     assert str(caught.value).startswith(output)
 
 
-def test_second_drive_of_one_start_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
-    """Only the first counts, so the user must learn that the other is not identified."""
-    other = [one._replace(payload=one.payload + bytes((0x20, 5))) for one in a_drive(["a"], [7], 3)]
+def test_drives_of_one_start_are_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    """Only the first counts, so the user must learn how many are not identified."""
+    others = [
+        one._replace(payload=one.payload + bytes((0x20, extra)))
+        for extra in (5, 6, 7)
+        for one in a_drive(["a"], [7], 3)
+    ]
     same = a_drive(["a", "b"], [7], 3)
     index_messages("one.mcap", lambda: [*same, *same], SITE)
     assert not caplog.records
-    index_messages("one.mcap, two.mcap", lambda: [*same, *other], SITE)
-    (warning,) = caplog.messages
-    assert warning.startswith("one.mcap, two.mcap: a has two drives with the same start; only the")
+    for sent, number in ((others[:6], 2), (others, 4)):
+        caplog.clear()
+        index_messages("one.mcap, two.mcap", [*same, *sent].copy, SITE)
+        (warning,) = caplog.messages
+        expected = f"one.mcap, two.mcap: a has {number} drives with the same start; only the first"
+        assert warning.startswith(expected)

@@ -31,11 +31,13 @@ def test_days_of_runs_are_one_recording(tmp_path: Path, has_tandem: bool) -> Non
 
 
 def test_schedule_in_words() -> None:
-    assert [Schedule(*one).in_words() for one in ((1, 1), (3, 1), (1, 5), (3, 5))] == [
-        "",
-        "3 runs of ",
-        "5 days, ",
-        "5 days, 3 runs of ",
+    start_s = datetime(2026, 5, 4, 9, 10, tzinfo=UTC).timestamp()
+    whens = ((1, 1), (3, 1), (1, 5), (3, 5, start_s))
+    assert [Schedule(*one).in_words(7.25) for one in whens] == [
+        "7.2 s, from 2026-01-01 00:00:00 UTC",
+        "3 runs of 7.2 s, from 2026-01-01 00:00:00 UTC",
+        "5 days, 7.2 s, from 2026-01-01 00:00:00 UTC",
+        "5 days, 3 runs of 7.2 s, from 2026-05-04 09:10:00 UTC",
     ]
 
 
