@@ -33,6 +33,12 @@ _AFTER_FAILURE: Final = (
 )
 
 
+_ONE_PROFILE: Final = (
+    " on one road profile under both axles, so real crossings are less accurate (to simulate two, "
+    "declare twin_tyre_distance_m or rear_axle_offset_m)"
+)
+
+
 def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
     """Validate every pair of the site, print a line for each; return 1 if one failed.
 
@@ -88,4 +94,6 @@ def line_of(certificate: ValidationRecord, path: Path) -> str:
     how = "passed" if certificate.passed else "FAILED"
     fewer = "" if figures.crossings == CROSSINGS else f" (of {CROSSINGS}, the rest not needed)"
     std = "" if figures.std is None else f"; EI ± {100.0 * figures.std:.0f} %"
+    if std and certificate.conditions.road == "groove":
+        std += _ONE_PROFILE
     return f"{certificate.pair}: {how}{fewer}: {certificate.reason}{std}; {path}"

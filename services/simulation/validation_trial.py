@@ -7,20 +7,14 @@ own survey speed and a road of its class; a 2-D surface where the site file desc
 different wheel paths. In every third crossing the bridge is undamaged except for one element of
 half its rigidity, so that the trial includes what is to be detected.
 
-`judged` is the rule; studies/site-validation.md argues it, studies/scripts/certificate_rates.py
-computes how often it errs. It looks at crossings in the order of their seeds, however they were
-computed, so one seed gives one certificate.
+`judge_trial` is the rule (studies/site-validation.md; studies/scripts/certificate_rates.py computes
+its error rates). It judges crossings in the order of their seeds, so one seed gives one record.
 """
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    Future,
-    ProcessPoolExecutor,
-    wait,
-)
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -386,7 +380,7 @@ def judge_trial(tried: Sequence[ValidationCrossing]) -> TrialOutcome | None:
     )
     if figures.crossings < CROSSINGS and not is_sure:
         return None
-    return TrialOutcome(True, _for(figures))
+    return TrialOutcome(True, _for(tried, figures))
 
 
 def _against(
@@ -431,16 +425,25 @@ def _against(
 
 
 def _why_not(tried: Sequence[ValidationCrossing]) -> str:
-    """Return the reasons of crossings that are not good, the most frequent first."""
-    found = [
-        reason for one in tried if one.verdict != "good" for reason in one.reasons or (one.verdict,)
-    ]
-    return ", ".join(sorted(set(found), key=lambda reason: (-found.count(reason), reason)))
+    """Return verdicts and reasons of crossings that are not good, the most frequent first."""
+    listed = []
+    others = [one for one in tried if one.verdict != "good"]
+    for verdict, number in Counter(one.verdict for one in others).most_common():
+        reasons = sorted(why for one in others if one.verdict == verdict for why in one.reasons)
+        listed.append(f"{number} {verdict}")
+        if reasons:
+            listed[-1] += f" ({', '.join(why for why, _ in Counter(reasons).most_common())})"
+    return ", ".join(listed)
 
 
-def _for(figures: ValidationFigures) -> str:
-    weak = f", a weak element is detected in {figures.weak_found} of {figures.weak}"
+def _for(tried: Sequence[ValidationCrossing], figures: ValidationFigures) -> str:
+    """Return the figures of a trial that passed, each with its limit."""
+    missed = figures.intervals - figures.covered
+    allowed = int((1.0 - LEAST_COVERAGE) * figures.intervals + 1e-9)
+    others = _why_not(tried)
+    weak = f"; a weak element is detected in {figures.weak_found} of {figures.weak}"
     return (
-        f"{figures.good} of {figures.crossings} crossings are good, {figures.covered} of "
-        f"{figures.intervals} intervals (95 %) contain the truth{weak if figures.weak else ''}"
+        f"{figures.good} of {figures.crossings} crossings are good{others and f', {others}'} (at "
+        f"least {FEWEST_GOOD} of {CROSSINGS} must be good); {missed} of {figures.intervals} "
+        f"intervals (95 %) miss the truth (at most {allowed} may){weak if figures.weak else ''}"
     )

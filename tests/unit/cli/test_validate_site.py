@@ -67,7 +67,7 @@ def test_every_pair_gets_a_line_and_a_file(
         "truck-2 on bridge-2",
     ]
     assert "passed (of 12, the rest not needed): 8 of 8 crossings are good" in lines[0]
-    assert "EI ± 10 %" in lines[0]
+    assert "EI ± 10 % on one road profile under both axles, so real crossings are less" in lines[0]
     assert "FAILED (of 12, the rest not needed): 0 of 5 crossings are good" in lines[1]
     found = {path: load_validation(path) for path in folder.iterdir()}
     assert len(found) == 4
@@ -77,6 +77,20 @@ def test_every_pair_gets_a_line_and_a_file(
         assert path.stem == pair_hash(known, one.pair, SETTINGS)
         assert one.passed == (one.bridge == "bridge-1")
         assert any(str(path) in line for line in lines)
+
+
+def test_line_names_the_road_only_where_both_axles_share_it(
+    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = load_site(site)
+    truck = known.vehicles[0].model_copy(update={"rear_axle_offset_m": 0.005})
+    path = tmp_path / "two_roads.toml"
+    path.write_text(site_toml(known.model_copy(update={"vehicles": (truck,)})))
+    folder = tmp_path / "certificates"
+    assert validate("--site", path, "--validations", folder, "--bridge", "bridge-1") == 0
+    line = capsys.readouterr().out
+    assert "EI ± 10 %;" in line
+    assert "one road profile" not in line
 
 
 def test_one_pair_may_be_asked_for(

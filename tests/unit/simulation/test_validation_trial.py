@@ -97,6 +97,18 @@ def test_it_passes_early_only_where_nothing_speaks_against_it() -> None:
         assert outcome(*some).passed
 
 
+def test_passed_trial_states_each_limit() -> None:
+    """A share of 87 % next to "95 %" reads as a failure where the limit is not stated."""
+    some = [made_up(k, 2.1, 0.0, 0.0, 0.0, 0.0) for k in range(7)]
+    some += [made_up(k, 0.0, 0.0, 0.0, 0.0, 0.0) for k in range(7, 11)]
+    passed, reason = outcome(*some, made_up(11, verdict="rejected"))
+    assert passed
+    assert reason == (
+        "11 of 12 crossings are good, 1 rejected (model_misfit) (at least 8 of 12 must be good); "
+        "7 of 55 intervals (95 %) miss the truth (at most 8 may)"
+    )
+
+
 def test_too_few_good_ones_fail_as_soon_as_that_is_sure() -> None:
     some = [made_up(k, verdict="rejected") for k in range(CROSSINGS - under_test.FEWEST_GOOD)]
     rest = [made_up(k) for k in range(under_test.FEWEST_GOOD)]
