@@ -19,8 +19,10 @@ from services.planning.alternatives import EQUAL_TYRES
 from services.planning.crossings import axles_of, has_declared_offset
 from services.planning.survey import MAX_CROSSINGS, PlanForecast, SurveyForecast
 
-_WORTH_NAMING: Final = 0.95
+_WORTH_NAMING: Final = 0.75
 """Share of the plan's crossings or smallest loss below which an alternative is worth a sentence."""
+_SMALLER_LOSS: Final = 0.95
+"""The same share of the smallest loss where no number of crossings detects the loss in question."""
 
 
 def advice(found: SurveyForecast) -> str:
@@ -133,7 +135,8 @@ def _helps(one: PlanForecast, planned: PlanForecast) -> bool:
         return False
     if ends < _WORTH_NAMING * planned_ends:
         return True
-    limit = _WORTH_NAMING * planned.expected.smallest_loss[planned.middle]
+    share = _WORTH_NAMING if planned_middle < inf else _SMALLER_LOSS
+    limit = share * planned.expected.smallest_loss[planned.middle]
     return ends <= planned_ends and bool(one.expected.smallest_loss[one.middle] < limit)
 
 

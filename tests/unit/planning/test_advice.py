@@ -70,6 +70,13 @@ def test_hardly_fewer_crossings_are_not_worth_a_sentence() -> None:
     assert named(forecast((100, None, 0.3), ends=(99, 200, 0.3))) == ["ends"]
 
 
+def test_gain_of_less_than_a_quarter_is_not_worth_a_sentence() -> None:
+    """Sensors of a quarter of the noise save 2 of 20 crossings at the ends: no help."""
+    planned = (1, 20, 0.1)
+    assert NONE_HELPS in advice(forecast(planned, quiet=(1, 18, 0.08), same=(1, 20, 0.08)))
+    assert named(forecast(planned, better=(1, 14, 0.1))) == ["better"]
+
+
 def test_ties_are_ranked_by_the_ends_then_by_the_loss() -> None:
     ties = forecast((9, None, 0.3), a=(5, None, 0.1), b=(5, 40, 0.2), c=(5, 40, 0.15))
     assert named(ties) == ["c", "b"]
