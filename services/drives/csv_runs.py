@@ -57,10 +57,12 @@ def csv_runs(
     if conversions and not how.accepts_guesses:
         shown = "; ".join(conversions[:_MAX_SHOWN])
         more = len(conversions) - _MAX_SHOWN
+        if more > 0:
+            shown += f"; and {more} more {'guess' if more == 1 else 'guesses'}"
         raise InputError(
-            f"{sources[0]}: is read by guesses that change numbers ({shown}"
-            f"{f'; and {more} more' if more > 0 else ''}): driveby import --preview shows them, "
-            "--yes or a map (--preview --write-map MAP.toml, then --map MAP.toml) confirms them"
+            f"{sources[0]}: is read by guesses that change numbers ({shown}): driveby import "
+            "--preview shows them, --yes or a map (--preview --write-map MAP.toml, then --map "
+            "MAP.toml) confirms them"
         )
     for guess in found.guesses:
         _log.log(logging.INFO if guess.kind == "form" else logging.WARNING, "%s", guess.text)

@@ -14,7 +14,8 @@ from schemas.results import CrossingResult, ElementState, RoadResult, Verdict
 _log = logging.getLogger(__name__)
 
 ONE_REALM: Final = (
-    "fuse one realm at a time (import --realm NAME files the drives of a campaign in one)"
+    "fuse one realm at a time (import --realm NAME files the drives of a campaign in one; "
+    "simulated drives too, after export)"
 )
 LISTED_AT_MOST = 100
 """Maximum number of fused crossings, the newest, and of named excluded ones.
