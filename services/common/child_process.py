@@ -26,6 +26,7 @@ from services.common.errors import EXIT_INTERRUPTED
 
 _CLEAN_UP_S = 2.0
 """Time to remove incomplete files; then the process ends in any case."""
+_NO_WARNING = "ignore:resource_tracker"
 _POLL_S = 0.1
 """Longest delay of the parent's end while a child works."""
 _OF_THE_GROUP = (signal.SIGINT, signal.SIGTERM)
@@ -75,13 +76,25 @@ def run_gently(arguments: Sequence[str], closing: threading.Event) -> ChildOutpu
             return ChildOutput(process.returncode, out, log)
 
 
+def _start_resource_tracker() -> None:
+    """Start the tracker of resources without its warnings: it cleans up after processes that exit.
+
+    It takes them from its start, which the first lock of multiprocessing would cause, too.
+    """
+    sys.warnoptions.append(_NO_WARNING)
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        sys.warnoptions.remove(_NO_WARNING)
+
+
 @contextmanager
 def group_signals_blocked() -> Iterator[None]:
     """Block the signals of a group in processes started here, which would die while they load.
 
     The tracker of resources would unblock them at its start, so it is started first.
     """
-    resource_tracker.ensure_running()
+    _start_resource_tracker()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_THE_GROUP)
     try:
         yield

@@ -387,10 +387,9 @@ class _Slot:
     def _open(self) -> None:
         receive, self._send = _SPAWN.Pipe(duplex=False)
         its_end, self._lifeline = _SPAWN.Pipe(duplex=False)
-        self._executor = ProcessPoolExecutor(
-            1, mp_context=_SPAWN, initializer=_prepare, initargs=(its_end, self._send, self._begin)
-        )
+        given = (its_end, self._send, self._begin)
         with _STARTING, group_signals_blocked():
+            self._executor = ProcessPoolExecutor(1, _SPAWN, _prepare, given)
             others = set(active_children())
             self.is_warm = self._executor.submit(os.getpid)  # which starts the process
             (self._process,) = set(active_children()) - others

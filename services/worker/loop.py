@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 from schemas.topics import HEALTH_PERIOD_S
 from schemas.validation_records import VehicleBridgePair
 from services.common.log_lines import about
+from services.common.naming import count_of
 from services.execution.dispatch import collect, drain
 from services.history.validation_files import passed_validations
 from services.identification.outputs import EngineOutput
@@ -171,7 +172,11 @@ class Loop:
             self._service.process_outputs(outputs)
 
     def hurry(self) -> None:
-        """Shorten all waiting after the stop."""
+        """Shorten all waiting after the stop; log once what is still finished."""
+        if self._leave_at_s == math.inf:
+            execution = self._service.execution
+            left = count_of(len(execution.running) + execution.waiting, "crossing")
+            _log.info("stopping: finishing %s; a second signal ends at once", left)
         self._leave_at_s = min(self._leave_at_s, time.monotonic() + GONE_AFTER_S)
         self._arrivals.hurry()
         self._service.certificates.end()

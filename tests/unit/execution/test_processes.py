@@ -499,3 +499,18 @@ def test_a_crossing_comes_before_whatever_waits_aside(tmp_path: Path) -> None:
         assert [task.name for task, _ in until_over(processes, 1)] == marks[1:2]
         assert processes.collect(0.1) == []
         assert processes.wants_background
+
+
+def test_end_at_a_second_signal_prints_nothing_of_leaked_semaphores() -> None:
+    """A worker leaves at once; the tracker of resources cleans up, which needs no warning."""
+    code = (
+        "import os, time\n"
+        "from services.execution.processes import ProcessExecutor\n"
+        "if __name__ == '__main__':\n"
+        "    ProcessExecutor(1, prepare=time.time)\n"
+        "    os._exit(130)\n"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert (ended.returncode, ended.stderr) == (130, "")
