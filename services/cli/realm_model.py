@@ -3,7 +3,9 @@
 No bus, no terminal, no clock: the time is given with each message.
 """
 
+import re
 from collections import deque
+from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -32,6 +34,8 @@ from services.viewer.crossing_view import (
     view_of_crossing,
 )
 
+_ENTRY: Final = re.compile(r"\.(\d{8}T\d{6}\.\d{3})Z$")
+"""Entry time at the end of a crossing's name."""
 _RATE_S: Final = 5.0
 """Duration in s over which rates are computed."""
 _LAGS: Final = 100
@@ -45,7 +49,11 @@ _MAX_TRUCKS: Final = 200
 _MAX_BRIDGES: Final = 200
 _MAX_SERVICES: Final = 50
 
+_LATE_S: Final = 60.0
+"""Time in s since an entry, beyond its truck's lag, after which it is found in a recording."""
 ON_BRIDGE: Final = "on the bridge"
+FROM_RECORDING: Final = "from a recording"
+"""State of a detected crossing whose truck has left the bridge long ago."""
 _STATES: Final = {
     pb.DETECTED: ON_BRIDGE,
     pb.COMPLETE: "complete",
@@ -158,7 +166,7 @@ class RealmModel:
                 case ("vehicle", "accel" | "gnss"):
                     return self._take_signal(key.identifier, key.stream, payload, now_s, now_ns)
                 case ("bridge", "crossing"):
-                    return self._take_state(pb.Crossing.FromString(payload))
+                    return self._take_state(pb.Crossing.FromString(payload), now_ns)
                 case ("bridge", "estimate"):
                     return self._take_result(
                         estimate_to_crossing(pb.Estimate.FromString(payload))[0]
@@ -207,8 +215,12 @@ class RealmModel:
             truck.fixes.append(now_s)
         return f"{vehicle} drives" if is_new else None
 
-    def _take_state(self, message: pb.Crossing) -> str | None:
+    def _take_state(self, message: pb.Crossing, now_ns: int) -> str | None:
         state = _STATES.get(message.state, "")
+        truck = self.trucks.get(message.vehicle)
+        age_s = (now_ns - message.entry_time_ns) * 1e-9 - (0.0 if truck is None else truck.lag_s)
+        if state == ON_BRIDGE and age_s > _LATE_S:
+            state = FROM_RECORDING
         row = self.crossings.get(message.crossing_id)
         if not state or (row is not None and (row.is_over or row.state == state)):
             return None
@@ -228,7 +240,7 @@ class RealmModel:
             crossing.vehicle,
             crossing.bridge,
             crossing.direction == "start_to_end",
-            round(crossing.entry_time * 1e9),
+            _entry_ns(crossing),
             crossing.verdict,
             lowest=lowest_element(crossing),
             reason=", ".join(crossing.reasons),
@@ -306,6 +318,15 @@ class RealmModel:
     def _make_room(self) -> None:
         if len(self.crossings) >= _MAX_CROSSINGS:
             self.crossings.pop(min(self.crossings, key=lambda name: self.crossings[name].entry_ns))
+
+
+def _entry_ns(crossing: CrossingResult) -> int:
+    """Return the entry in the crossing's name, as its states have it; else the estimated one."""
+    found = _ENTRY.search(crossing.crossing_id)
+    if found is None:
+        return round(crossing.entry_time * 1e9)
+    entry = datetime.strptime(found[1], "%Y%m%dT%H%M%S.%f").replace(tzinfo=UTC)
+    return round(entry.timestamp() * 1e3) * 1_000_000
 
 
 def route_text(row: CrossingRow) -> str:

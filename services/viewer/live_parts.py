@@ -180,7 +180,7 @@ def _alarm_text(alarm: Alarm | None) -> str:
 
 def clock_text(crossing: CrossingResult) -> str:
     """Return the time of a crossing, UTC."""
-    moment = np.datetime64(round(crossing.entry_time), "s")
+    moment = np.datetime64(int(crossing.entry_time), "s")
     return f"{str(moment).replace('T', ' ')} UTC"
 
 

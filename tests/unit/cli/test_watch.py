@@ -101,16 +101,43 @@ def test_bars_say_which_element_is_weak() -> None:
     }
 
 
+def test_crossing_found_in_a_recording_is_not_on_the_bridge() -> None:
+    """A worker that identifies yesterday's crossing announces it after the truck has left."""
+    watched = RealmModel()
+    old = deliver(watched, state("a", pb.DETECTED, "truck-1", 0.0), ago_s=500.0)
+    assert old is not None
+    assert old.endswith(": from a recording")
+    assert (watched.rows()[0].state, watched.waiting) == ("from a recording", 1)
+    new = deliver(watched, state("b", pb.DETECTED, "truck-1", 595.0))
+    assert new is not None
+    assert new.endswith(": on the bridge")
+    drives(watched, "truck-2", lag_s=400.0)  # as in a replay: all of it is late
+    late = deliver(watched, state("c", pb.DETECTED, "truck-2", 190.0))
+    assert late is not None
+    assert late.endswith(": on the bridge")
+
+
+def test_entry_of_a_result_is_that_of_its_states(site: Site) -> None:
+    """The estimated entry differs from the detected one, by which the crossing is named."""
+    watched = RealmModel()
+    name = "truck-1.bridge-1.20260921T141320.900Z"
+    crossing = result(site, name).model_copy(update={"entry_time": 1_790_000_001.2})
+    for message in (state(name, pb.DETECTED, "truck-1", 0.9), estimate(crossing)):
+        line = deliver(watched, message, ago_s=598.0)
+        assert line is not None
+        assert "entry 2026-09-21 14:13:20: " in line
+
+
 def test_lines_for_a_pipe(site: Site) -> None:
     watched = RealmModel()
     output = [one for one in drives(watched, "truck-1") if one is not None]
     output += [
         one
         for message in (
-            state("a", pb.DETECTED, "truck-1", 0.0),
-            state("a", pb.DETECTED, "truck-1", 0.0),
-            state("a", pb.COMPLETE, "truck-1", 0.0),
-            state("a", pb.IDENTIFYING, "truck-1", 0.0),
+            state("a", pb.DETECTED, "truck-1", 590.0),
+            state("a", pb.DETECTED, "truck-1", 590.0),
+            state("a", pb.COMPLETE, "truck-1", 590.0),
+            state("a", pb.IDENTIFYING, "truck-1", 590.0),
             progress("worker", "a", "sampling", 0.5),
             estimate(result(site, "a")),
             state("a", pb.DONE, "truck-1", 0.0),
@@ -121,9 +148,9 @@ def test_lines_for_a_pipe(site: Site) -> None:
     ]
     assert output == [
         "truck-1 drives",
-        "truck-1 → bridge-1, entry 2026-09-21 14:13:20: on the bridge",
-        "truck-1 → bridge-1, entry 2026-09-21 14:13:20: complete",
-        "truck-1 → bridge-1, entry 2026-09-21 14:13:20: identifying",
+        "truck-1 → bridge-1, entry 2026-09-21 14:23:10: on the bridge",
+        "truck-1 → bridge-1, entry 2026-09-21 14:23:10: complete",
+        "truck-1 → bridge-1, entry 2026-09-21 14:23:10: identifying",
         (
             "truck-1 → bridge-1, entry 2026-09-21 14:13:20: "
             "good, lowest EI_4 0.400 of nominal (95 %: 0.377 to 0.424)"
@@ -198,13 +225,13 @@ def test_work_of_a_replaced_worker_is_not_shown() -> None:
 
 def test_crossing_of_a_silent_truck_waits_for_samples() -> None:
     watched = RealmModel()
-    deliver(watched, state("a", pb.DETECTED, "truck-1", 0.0))
+    deliver(watched, state("a", pb.DETECTED, "truck-1", 580.0))
     drives(watched, "truck-1")
-    assert line(drawn(watched), "14:13:20").endswith("on the bridge")
+    assert line(drawn(watched), "14:23:00").endswith("on the bridge")
     watched = RealmModel()
-    deliver(watched, state("a", pb.DETECTED, "truck-1", 0.0))
+    deliver(watched, state("a", pb.DETECTED, "truck-1", 580.0))
     drives(watched, "truck-1", ago_s=20.0)
-    assert line(drawn(watched), "14:13:20").endswith("waits for samples")
+    assert line(drawn(watched), "14:23:00").endswith("waits for samples")
 
 
 def test_what_it_keeps_is_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
