@@ -25,8 +25,8 @@ def health_line(figures: Mapping[str, float]) -> str:
         f"lag {known['lag_s']:.2f} s{why}, queue {known['queue']:.0f}, lost {known['lost']:.0f}, "
         f"missing {known['missing']:.0f}, recovered {known['recovered']:.0f}, "
         f"duplicates {known['duplicates']:.0f}, refused {known['refused']:.0f}, "
-        f"dropped {known['dropped']:.0f}, written {known['written']:.0f} to "
-        f"{count_of(known['files'], 'file')}, {known['disk_free_bytes'] / 1e9:.1f} GB left"
+        f"dropped {known['dropped']:.0f}, written {known['written']:.0f}, "
+        f"{count_of(known['files'], 'open file')}, {known['disk_free_bytes'] / 1e9:.1f} GB left"
     )
 
 

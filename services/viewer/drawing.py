@@ -23,6 +23,7 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from services.common.arrays import Floats
 from services.common.files import write_atomically
 from services.common.language import ENGLISH, Language
+from services.common.naming import count_of
 from services.viewer.crossing_view import TRUTH_COLOUR, VEHICLE_COLOURS, VERDICT_COLOURS
 
 WIDTH_IN, DPI = 9.0, 200  # 1800 pixels: sharp at the 900 of a repository page
@@ -123,7 +124,8 @@ def draw_verdict(
         colour = VERDICT_COLOURS["good"]
         figure.text(LEFT, top, "verdict: good", color=colour, fontweight="bold", **words)
         if sentences:
-            more = f" (and {len(sentences) - 1} more)" if len(sentences) > 1 else ""
+            others = count_of(len(sentences) - 1, "more sentence")
+            more = f" (and {others})" if len(sentences) > 1 else ""
             short = shortened(sentences[0], _BESIDE_VERDICT - len(more)) + more
             figure.text(
                 LEFT + 0.12, top, short, color=INK, fontsize=8.3, va="top", parse_math=False

@@ -22,5 +22,5 @@ def test_right_clocks_need_no_note() -> None:
 def test_one_truck_and_one_file_are_singular() -> None:
     line = health_line({"trucks_alive": 1.0, "files": 1.0})
     assert line.startswith("1 truck, ")
-    assert " to 1 file, " in line
+    assert ", 1 open file, " in line
     assert health_line({}).startswith("0 trucks, ")
