@@ -333,17 +333,26 @@ def first_compared_axle(crossing: CrossingResult) -> int:
     return 2 if "share" in (crossing.parameters or {}) else 1
 
 
+def unresolved_names(crossing: CrossingResult) -> list[str]:
+    """Return the names of the elements that a crossing could not resolve."""
+    return [
+        name
+        for name, one in (crossing.parameters or {}).items()
+        if name.startswith("EI_") and one.std > RESOLVED * abs(one.mean)
+    ]
+
+
 def unresolved_note(crossing: CrossingResult) -> str | None:
     """Return which elements a crossing could not resolve, in words; None if it resolved all."""
     if crossing.parameters is None or crossing.derived is None or crossing.derived.ei_level is None:
         return None
-    elements = [p for name, p in crossing.parameters.items() if name.startswith("EI_")]
-    open_ones = sum(p.std > RESOLVED * abs(p.mean) for p in elements)
-    if open_ones == 0:
+    open_ones = unresolved_names(crossing)
+    if not open_ones:
         return None
     level = crossing.derived.ei_level
     spread = 100.0 * level.std / level.mean
-    which = f"{open_ones} of {len(elements)} elements"
+    elements = sum(name.startswith("EI_") for name in crossing.parameters)
+    which = f"{len(open_ones)} of {elements} elements"
     return f"overall stiffness {level.mean:.2f} of nominal ± {spread:.0f} %, {which} not resolved"
 
 

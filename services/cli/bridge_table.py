@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 from schemas.reasons import LEFT_OUT_TEXTS, BridgeReason
 from schemas.results import BridgeResult, ElementState, Parameter, Thirds, ThirdsState
 from services.common.naming import count_of
+from services.identification.comparison import describe_level
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -58,11 +59,16 @@ def print_bridge(console: "Console", bridge: BridgeElements, state: BridgeResult
     has_meaning = BridgeReason.NOT_FUSED not in state.reasons
     print_elements(console, bridge, state.elements, has_meaning, state.probability_of_loss)
     if state.finding is not None:
-        console.print(f"[bold]the bridge:[/] {state.finding}", highlight=False)
+        print_finding(console, state)
         if state.probability_of_loss is None and len(_days(state)) > 1:
             console.print(_NO_CHANGE, highlight=False)
     for line in _of_state(state):
         console.print(line, highlight=False)
+
+
+def print_finding(console: "Console", state: BridgeResult) -> None:
+    """Print the finding of a state."""
+    console.print(f"[bold]the bridge:[/] {state.finding}", highlight=False)
 
 
 def _days(state: BridgeResult) -> set[str]:
@@ -70,17 +76,30 @@ def _days(state: BridgeResult) -> set[str]:
     return {found[1] for name in state.crossings_used if (found := _ENTRY.search(name))}
 
 
-def level_lines(level: Parameter | ElementState, thirds: Thirds | ThirdsState) -> Iterator[str]:
-    """Yield the overall stiffness and that of the thirds, with their standard deviations."""
+def level_lines(
+    level: Parameter | ElementState,
+    thirds: Thirds | ThirdsState,
+    *,
+    is_stated: bool = False,
+) -> Iterator[str]:
+    """Yield the overall stiffness, unless it is stated already, and that of the thirds."""
     parts = (thirds.left, thirds.middle, thirds.right)
-    yield f"overall stiffness: {level.mean:.2f} ± {level.std:.2f} of nominal"
+    if not is_stated:
+        yield f"overall stiffness: {level.mean:.2f} ± {level.std:.2f} of nominal"
     listed = ", ".join(f"{part.mean:.2f} ± {part.std:.2f}" for part in parts)
     yield f"thirds of the span: {listed} (standard deviations)"
 
 
+def states_level(state: BridgeResult) -> bool:
+    """Return whether the finding of a state has its overall stiffness."""
+    if state.finding is None or state.level is None:
+        return False
+    return describe_level(state.level) in state.finding
+
+
 def _of_state(state: BridgeResult) -> Iterator[str]:
     if state.level is not None and state.thirds is not None:
-        yield from level_lines(state.level, state.thirds)
+        yield from level_lines(state.level, state.thirds, is_stated=states_level(state))
     if state.between_crossing_std is not None and len(state.crossings_used) == 1:
         yield (
             "single crossing: intervals include the between-crossing variability, which one "

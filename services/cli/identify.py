@@ -1,6 +1,7 @@
 """The command `driveby identify`: identify crossings of recordings, print and write results."""
 
 import logging
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from itertools import chain
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from schemas.results import (
+    RESOLVED,
     AtEnds,
     BridgeResult,
     CrossingResult,
@@ -15,13 +17,19 @@ from schemas.results import (
     Results,
     is_torsion_declared,
     results_json,
-    unresolved_note,
+    unresolved_names,
 )
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Site
 from schemas.validation_records import VehicleBridgePair
 from services.catalogue.contents import summarise_recording
-from services.cli.bridge_table import level_lines, print_bridge, print_elements
+from services.cli.bridge_table import (
+    level_lines,
+    print_bridge,
+    print_elements,
+    print_finding,
+    states_level,
+)
 from services.cli.settings import IdentifyOptions
 from services.common.errors import FailureError, InputError
 from services.common.files import (
@@ -249,17 +257,24 @@ def _print(console: "Console", found: Results, site: Site) -> None:
         bridges = ", ".join(bridge.id for bridge in site.bridges)
         console.print(f"no crossing of a known bridge ({bridges})")
         return
+    crossed = Counter(crossing.bridge for crossing in found.crossings)
+    alone = {
+        name: state
+        for name, state in found.bridges.items()
+        if crossed[name] == 1 and state.probability_of_loss is None
+    }
+    stated = {name for name, state in alone.items() if states_level(state)}
     for number, crossing in enumerate(found.crossings):
         if number > 0:
             console.print()
-        _print_crossing(console, crossing, site)
+        _print_crossing(console, crossing, site, is_level_stated=crossing.bridge in stated)
     for name, state in found.bridges.items():
-        crossed = [crossing for crossing in found.crossings if crossing.bridge == name]
-        if len(crossed) > 1 or state.probability_of_loss is not None:
+        if name not in alone:
             console.print()
             print_bridge(console, site.bridge(name), state)
         elif state.between_crossing_std is not None:
             console.print(_as_state(site.bridge(name), state), highlight=False)
+            print_finding(console, state)
 
 
 def print_validation(console: "Console", found: Results, site: Site, folder: Path) -> None:
@@ -283,7 +298,9 @@ def _as_state(bridge: Bridge, state: BridgeResult) -> str:
     )
 
 
-def _print_crossing(console: "Console", crossing: CrossingResult, site: Site) -> None:
+def _print_crossing(
+    console: "Console", crossing: CrossingResult, site: Site, *, is_level_stated: bool
+) -> None:
     method = crossing.method.replace("_", " ")
     console.print(
         f"[bold]{crossing.crossing_id}[/]\n"
@@ -304,10 +321,14 @@ def _print_crossing(console: "Console", crossing: CrossingResult, site: Site) ->
         "no_noise_model" not in crossing.reasons,
         None if crossing.derived is None else _below(crossing.derived),
     )
-    words = unresolved_note(crossing)
-    if words is not None:
-        console.print(f"[bold]{words}[/]", highlight=False)
-    for line in _fit_lines(crossing):
+    unresolved = unresolved_names(crossing)
+    if unresolved:
+        console.print(
+            f"[bold]not resolved: {', '.join(unresolved)}[/] (standard deviation above "
+            f"{100.0 * RESOLVED:.0f} %)",
+            highlight=False,
+        )
+    for line in _fit_lines(crossing, is_level_stated=is_level_stated):
         console.print(line, highlight=False)
 
 
@@ -335,11 +356,11 @@ def _support_lines(derived: Derived, *, torsion_declared: bool) -> Iterator[str]
         yield f"weight of the suspension equations: {100.0 * derived.springs_believed:.0f} %"
 
 
-def _level_lines(crossing: CrossingResult) -> Iterator[str]:
+def _level_lines(crossing: CrossingResult, *, is_stated: bool) -> Iterator[str]:
     """Describe level and thirds of EI, and the mismatch of the road profiles."""
     derived = crossing.derived
     if derived is not None and derived.ei_level is not None and derived.ei_thirds is not None:
-        yield from level_lines(derived.ei_level, derived.ei_thirds)
+        yield from level_lines(derived.ei_level, derived.ei_thirds, is_stated=is_stated)
     if crossing.road is not None and crossing.road.mismatch is not None:
         mismatch = crossing.road.mismatch
         yield (
@@ -353,7 +374,7 @@ def _level_lines(crossing: CrossingResult) -> Iterator[str]:
         )
 
 
-def _fit_lines(crossing: CrossingResult) -> Iterator[str]:
+def _fit_lines(crossing: CrossingResult, *, is_level_stated: bool = False) -> Iterator[str]:
     """Describe how well the model fits and what all intervals have in common."""
     diagnostics = crossing.diagnostics
     if crossing.scale_error is not None:
@@ -366,7 +387,7 @@ def _fit_lines(crossing: CrossingResult) -> Iterator[str]:
     if crossing.hum_hz():
         found = ", ".join(f"{hz:.1f} Hz" for hz in crossing.hum_hz())
         yield f"hum removed from the signals: {found}"
-    yield from _level_lines(crossing)
+    yield from _level_lines(crossing, is_stated=is_level_stated)
     if crossing.derived is not None:
         declared = is_torsion_declared(crossing)
         yield from _support_lines(crossing.derived, torsion_declared=declared)

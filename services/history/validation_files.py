@@ -93,6 +93,23 @@ def validation_notes(
         yield language.text("caution.unvalidated", trucks=language.listed(untried))
 
 
+def validations_passed(
+    folder: Path, site: Site, crossings: Iterable[CrossingResult], language: Language = ENGLISH
+) -> Iterator[str]:
+    """Yield a sentence for each pair of the crossings whose validation record has passed."""
+    pairs = (VehicleBridgePair(one.vehicle, one.bridge) for one in crossings if one.method == "pre")
+    for pair in dict.fromkeys(pairs):
+        record = _record_of(folder, site, pair)
+        if record is not None and record.passed:
+            figures = record.figures
+            yield language.text(
+                "quality.validated",
+                truck=pair.vehicle,
+                covered=figures.covered,
+                intervals=figures.intervals,
+            )
+
+
 def _record_of(folder: Path, site: Site, pair: VehicleBridgePair) -> ValidationRecord | None:
     """Return the record of a pair of the site; None without one."""
     try:

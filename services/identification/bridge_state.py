@@ -29,8 +29,10 @@ from services.identification.comparison import (
     compare,
     describe_clear_elements,
     describe_comparison,
+    describe_weak_before,
     estimate_of_state,
     unresolved_elements,
+    weak_before,
 )
 from services.identification.fusing import FusedBridge, fused
 from services.identification.result_parts import part_of_elements
@@ -281,6 +283,10 @@ def _finding(found: FusedBridge, state: BridgeResult, baseline: BridgeResult | N
         # The excluded crossings may show what the others do not: no element is cleared.
         clear = [] if comparison is None else describe_clear_elements(comparison)
         return " ".join([*clear, ENGLISH.text("contradicted")])
-    return " ".join(
-        describe_comparison(comparison, unresolved_elements(state.elements.values()), state.level)
-    )
+    unresolved = unresolved_elements(state.elements.values())
+    wording = describe_comparison(comparison, unresolved, state.level)
+    if baseline is not None and comparison is not None:
+        edges = np.concatenate([[0.0], np.cumsum(found.element_lengths_m)])
+        weak = weak_before(estimate_of_state(baseline), found.nominal_nm2, edges)
+        wording += describe_weak_before(weak)
+    return " ".join(wording)

@@ -256,9 +256,35 @@ def describe_comparison(
     if resolved and "visible" not in without:
         wordings.append(language.text("rest.resolved", loss=_smallest_seen(resolved)))
     if level is not None:
-        std = 100.0 * level.std / level.mean
-        wordings.append(language.text("level", mean=level.mean, std=std))
+        wordings.append(describe_level(level, language))
     return wordings
+
+
+def describe_level(level: ElementState, language: Language = ENGLISH) -> str:
+    """Return the sentence on the overall stiffness."""
+    return language.text("level", mean=level.mean, std=100.0 * level.std / level.mean)
+
+
+def weak_before(baseline: Estimate, nominal: Floats, edges_m: Floats) -> tuple[Element, ...]:
+    """Return the elements that were clearly less stiff than the others in a baseline."""
+    alone = compare(baseline, nominal, edges_m)
+    return () if alone is None else alone.weak
+
+
+def describe_weak_before(weak: Sequence[Element], language: Language = ENGLISH) -> Iterator[str]:
+    """Yield that elements were weak in the baseline already; nothing without any."""
+    if weak:
+        listed = [
+            language.text(
+                "caution.loss",
+                number=one.number,
+                loss=100.0 * (1.0 - one.ratio),
+                low=100.0 * (1.0 - one.high),
+                high=100.0 * (1.0 - one.low),
+            )
+            for one in weak
+        ]
+        yield language.choice("caution.earlier", len(weak), elements=language.listed(listed))
 
 
 def describe_clear_elements(found: Comparison, language: Language = ENGLISH) -> list[str]:

@@ -23,7 +23,7 @@ def next_steps(report: BridgeReport, language: Language) -> Iterator[str]:
             yield from _implausible(report, language)
             yield from _stiffer(report, language)
             yield from _drive_again(report, language)
-        case "sound":
+        case "sound" | "known":
             yield language.text("advice.sound")
             yield from _possibly(report, language)
             yield from _earlier(report, language)

@@ -7,8 +7,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from schemas.results import RESOLVED, BridgeResult, CrossingResult, Results
 from schemas.site import Bridge, Site
 from services.common.errors import InputError
@@ -17,33 +15,36 @@ from services.common.language import ENGLISH, Language
 from services.common.options import CERTIFICATES
 from services.execution.blas import one_blas_thread
 from services.history.bridge_history import BridgeHistory
-from services.history.validation_files import pairs_without_validation, validation_notes
+from services.history.validation_files import (
+    pairs_without_validation,
+    validation_notes,
+    validations_passed,
+)
 from services.identification.comparison import (
     Comparison,
     Estimate,
     Stated,
     compare,
     per_cent_up,
+    weak_before,
 )
 from services.report.cautions import CautionBasis, cautions
 from services.report.earlier import Before, SurveyFile, before_of, combined_surveys
+from services.report.quality import MAX_REASONS, quality, realm_of, reasons_of
 from services.viewer.bridge_view import BridgeView, describe_bridge, view_of_bridge
 
 _LATEST_S = 7_258_118_400.0
 """The year 2200, as a Unix time in s."""
-_LARGEST_DEVIATION = 4.0
-"""Standard deviations beyond which crossings do not agree."""
 LARGEST_MISSED_LOSS = 0.2
 """Visible loss of an element above which no finding is `sound`: the one that surveys plan for."""
-_MAX_REASONS = 3
-"""Maximum number of reasons in the box; all of them are listed below it."""
 
 
 class BridgeFinding(NamedTuple):
     """The conclusion, with its certainty."""
 
     kind: str
-    """One of `weak`, `sound`, `open` (a loss may have been missed), `doubtful` and `nothing`."""
+    """One of `weak`, `known` (weak before and unchanged), `sound`, `open` (a loss may have been
+    missed), `doubtful` and `nothing`."""
     headline: str
     sentences: tuple[str, ...]
 
@@ -145,6 +146,7 @@ def _report(
     combined = None if before is not None else combined_surveys(_survey_files(name, about), used)
     pairs = pairs_without_validation(used)
     notes = tuple(validation_notes(validations, site, pairs, language))
+    passed = validations_passed(validations, site, used, language)
     basis = CautionBasis(bridge, view, used, before, combined, notes)
     return BridgeReport(
         bridge,
@@ -156,7 +158,7 @@ def _report(
         site,
         before,
         _finding(view, crossings, stored, language),
-        _quality(view, crossings, language),
+        " ".join((quality(view, crossings, language), *passed)),
         tuple(cautions(basis, language)),
     )
 
@@ -179,13 +181,6 @@ def _latest_state(
 
     states = [results.bridges[name] for results in files if name in results.bridges]
     return max(states, key=moment) if states else None
-
-
-def _realm(state: BridgeResult | None, crossings: Sequence[CrossingResult]) -> str:
-    """Return the realm of the last crossing in the state, or of the last one; "" without any."""
-    used = () if state is None else state.crossings_used
-    own = [one for one in crossings if one.crossing_id in used] or crossings
-    return own[-1].realm if own else ""
 
 
 def _state_of_all(
@@ -220,7 +215,7 @@ def _one_by_one(
     """
     state = view.state
     left_out = set() if state is None else {one.crossing_id for one in state.crossings_left_out}
-    realm = _realm(state, crossings)
+    realm = realm_of(state, crossings)
     own = {one.crossing_id for one in crossings if one.realm == realm}
     good = [
         one
@@ -286,6 +281,12 @@ def _finding(
         key = "finding.appears" if but else "finding.weak"
         return BridgeFinding("weak", language.choice(key, len(weak)) + but, wording)
     missed = _why_open(view, view.comparison, language)
+    known = _still_weak(view, baseline)
+    if known:
+        headline = language.choice("finding.known", len(known), elements=language.listed(known))
+        seen = () if missed is None else (_seen(view.comparison, language),)
+        kind = "known" if missed is None and not but else "open"
+        return BridgeFinding(kind, headline + but, (*wording, *seen))
     if missed is None:
         kind = "open" if but else "sound"
         return BridgeFinding(kind, language.text("finding.none") + but, wording)
@@ -295,6 +296,16 @@ def _finding(
     described = describe_bridge(view, language, without)
     sentences = (*described, *single, _seen(view.comparison, language))
     return BridgeFinding("open", missed + but, sentences)
+
+
+def _still_weak(view: BridgeView, baseline: Estimate | None) -> list[str]:
+    """Return the numbers of the elements that are as weak as in the baseline."""
+    if baseline is None or view.estimate is None:
+        return []
+    now = compare(view.estimate, view.nominal_nm2, view.edges_m)
+    before = weak_before(baseline, view.nominal_nm2, view.edges_m)
+    numbers = {one.number for one in before} & {one.number for one in (now.weak if now else ())}
+    return [str(number) for number in sorted(numbers)]
 
 
 def _but_implausible(found: Comparison, language: Language) -> str:
@@ -344,16 +355,10 @@ def _reasons_of_state(
             yield from reasons_of(crossing, language)
 
 
-def reasons_of(crossing: CrossingResult, language: Language) -> list[str]:
-    """Return the sentence of each reason of a crossing."""
-    pairs = zip(crossing.reasons, crossing.reason_texts, strict=True)
-    return [language.reason(code.value, text) for code, text in pairs]
-
-
 def _no_finding(crossings: Sequence[CrossingResult], language: Language) -> BridgeFinding:
     """Return the finding without a usable crossing: the most frequent reasons."""
     counted = Counter(text for crossing in crossings for text in reasons_of(crossing, language))
-    why = " ".join(text for text, _ in counted.most_common(_MAX_REASONS))
+    why = " ".join(text for text, _ in counted.most_common(MAX_REASONS))
     suspect = sum(crossing.verdict == "suspect" for crossing in crossings)
     total = len(crossings)
     if not suspect:
@@ -364,92 +369,3 @@ def _no_finding(crossings: Sequence[CrossingResult], language: Language) -> Brid
         which = language.choice("nothing.mixed", suspect, total=total)
     which += " " + language.choice("nothing.drawn", suspect)
     return BridgeFinding("doubtful", language.text("finding.nothing_yet"), (which, why))
-
-
-def _quality(view: BridgeView, crossings: Sequence[CrossingResult], language: Language) -> str:
-    counts = Counter(crossing.verdict for crossing in crossings)
-    verdicts = ", ".join(
-        f"{counts[v]} {language.text(v)}" for v in ("good", "suspect", "rejected") if counts[v]
-    )
-    parts = [language.choice("quality.count", len(crossings), verdicts=verdicts)]
-    campaigns = sorted({one.realm for one in crossings} - {_realm(view.state, crossings)})
-    if campaigns:
-        number = sum(one.realm in campaigns for one in crossings)
-        realms = ", ".join(campaigns)
-        parts.append(language.choice("quality.other_realm", number, realms=realms))
-    if view.estimate is None:
-        return " ".join((*parts, language.text("quality.none")))
-    last = list(_excluded(view, crossings, language))
-    if view.comparison is not None and view.comparison.implausible and not view.is_doubtful:
-        last.append(language.text("quality.implausible"))
-    if view.state is not None and len(view.used) > 1:
-        together = _together(view.state, len(crossings), language)
-        return " ".join((*parts, *together, *last))
-    others = [c for c in crossings if c.verdict == "good" and c.crossing_id not in view.used]
-    parts.append(language.text("quality.this" if len(crossings) == 1 else "quality.newest"))
-    if view.state is not None and view.state.between_crossing_std is not None:
-        parts.append(language.text("quality.with_variability"))
-    deviation = _largest_deviation(view.estimate, others)
-    if deviation is None:
-        parts.append(language.text("quality.unconfirmed"))
-    else:
-        which = "agree" if deviation <= _LARGEST_DEVIATION else "disagree"
-        parts.append(language.choice(f"quality.{which}", len(others), deviation=deviation))
-    return " ".join((*parts, *last))
-
-
-def _together(state: BridgeResult, crossings: int, language: Language) -> Iterator[str]:
-    """Yield sentences on the quality of fused crossings."""
-    used = len(state.crossings_used)
-    which = "quality.all_together" if used == crossings else "quality.some_together"
-    yield language.text(which, number=used, verdict=language.text(state.verdict or "good"))
-    low, high = state.between_crossing_std_q025, state.between_crossing_std_q975
-    if state.between_crossing_std is not None and low is not None and high is not None:
-        yield language.text(
-            "quality.variability",
-            std=100.0 * state.between_crossing_std,
-            low=100.0 * low,
-            high=100.0 * high,
-        )
-
-
-def _excluded(
-    view: BridgeView, crossings: Sequence[CrossingResult], language: Language
-) -> Iterator[str]:
-    """Yield how many crossings of the campaign are not in the numbers, and why."""
-    realm = _realm(view.state, crossings)
-    own = [one for one in crossings if one.realm == realm]
-    left_out = () if view.state is None else view.state.crossings_left_out
-    verdicts = {one.crossing_id: one.verdict for one in own if one.crossing_id not in view.used}
-    reasons = []
-    for verdict in ("rejected", "suspect"):
-        some = [one for one in own if verdicts.get(one.crossing_id) == verdict]
-        why = Counter(text for crossing in some for text in reasons_of(crossing, language))
-        listed = " ".join(text for text, _ in why.most_common(_MAX_REASONS))
-        why_text = listed.removesuffix(".")
-        values = {"number": len(some), "verdict": language.text(verdict), "why": why_text}
-        if some:
-            reasons.append(language.text("quality.left_out_because", **values))
-    counted = Counter(
-        language.left_out.get(one.reason, one.reason)
-        for one in left_out
-        if verdicts.get(one.crossing_id, "good") == "good"
-    )
-    reasons += [f"{number} {why}" for why, number in counted.most_common()]
-    if reasons:
-        yield language.text("quality.left_out", reasons="; ".join(reasons))
-
-
-def _largest_deviation(estimate: Estimate, others: Sequence[CrossingResult]) -> float | None:
-    """Return the largest difference of an element in standard deviations, in logarithms."""
-    width = np.log(estimate.high / estimate.low) / (2.0 * 1.96)
-    found = []
-    for crossing in others:
-        parameters = crossing.parameters or {}
-        elements = [parameters.get(f"EI_{n}") for n in range(1, estimate.mean.size + 1)]
-        for n, element in enumerate(elements):
-            if element is None or element.mean <= 0.0 or element.std <= 0.0:
-                return None
-            both = np.hypot(width[n], element.std / element.mean)
-            found.append(abs(np.log(element.mean / estimate.mean[n])) / both)
-    return float(max(found)) if found else None

@@ -17,8 +17,10 @@ from services.identification.comparison import (
     Comparison,
     Element,
     compare,
+    describe_weak_before,
     shared_crossings,
 )
+from services.identification.comparison import weak_before as of_baseline
 from services.report.earlier import Before, CombinedSurveys, days_between, season_of
 from services.report.place import ends_of
 from services.viewer.bridge_view import BridgeView
@@ -74,8 +76,7 @@ def possibly_weak(view: BridgeView) -> tuple[Element, ...]:
 
 def weak_before(view: BridgeView, before: Before | None) -> tuple[Element, ...]:
     """Return the elements that were clearly less stiff than the others in the baseline."""
-    found = _alone(view, before)
-    return () if found is None else found.weak
+    return () if before is None else of_baseline(before.estimate, view.nominal_nm2, view.edges_m)
 
 
 def _alone(view: BridgeView, before: Before | None) -> Comparison | None:
@@ -146,19 +147,7 @@ def _lower(view: BridgeView, comparison: Comparison, language: Language) -> Iter
 
 
 def _earlier(measured: CautionBasis, language: Language) -> Iterator[str]:
-    weak = weak_before(measured.view, measured.before)
-    if weak:
-        listed = [
-            language.text(
-                "caution.loss",
-                number=one.number,
-                loss=100.0 * (1.0 - one.ratio),
-                low=100.0 * (1.0 - one.high),
-                high=100.0 * (1.0 - one.low),
-            )
-            for one in weak
-        ]
-        yield language.choice("caution.earlier", len(weak), elements=language.listed(listed))
+    yield from describe_weak_before(weak_before(measured.view, measured.before), language)
 
 
 def _seasons(measured: CautionBasis, language: Language) -> Iterator[str]:

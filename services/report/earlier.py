@@ -31,6 +31,8 @@ class Before(NamedTuple):
     """Crossings that it includes, in order of time, as far as its file has them."""
     used: frozenset[str] = frozenset()
     """Ids of all crossings that it includes."""
+    excluded: int = 0
+    """Number of crossings of the bridge that it does not include, whatever their verdict."""
 
 
 class SurveyFile(NamedTuple):
@@ -66,7 +68,9 @@ def before_of(
     used = (one for one in stored.crossings if one.crossing_id in state.crossings_used)
     crossings = tuple(sorted(used, key=lambda crossing: crossing.entry_time))
     ids = frozenset(state.crossings_used)
-    return Before(name, estimate, state.verdict or "good", crossings, ids)
+    of_bridge = [one for one in stored.crossings if one.bridge == bridge.id]
+    excluded = max(state.crossings_left_out_count, len(of_bridge) - len(crossings))
+    return Before(name, estimate, state.verdict or "good", crossings, ids, excluded)
 
 
 def combined_surveys(

@@ -9,10 +9,11 @@ import matplotlib
 
 from schemas.results import CrossingResult, is_torsion_declared
 from services.common.language import Language, utc_second
-from services.report.bridge import BridgeReport, reasons_of
+from services.report.bridge import BridgeReport
 from services.report.html import Html, inlined_svg, joined, table, tag
 from services.report.measurement import sensor_lines, truck_line, vehicles_of
 from services.report.place import ends_of
+from services.report.quality import reasons_of
 from services.viewer.crossing_view import view_of_crossing
 from services.viewer.crossings_figure import draw_crossings
 from services.viewer.drawing import STYLE, figure_bytes

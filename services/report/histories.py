@@ -55,7 +55,7 @@ def with_history(report: BridgeReport, past: BridgeHistory, language: Language) 
     if past.active_alarms:
         alarms = "; ".join(alarm_sentence(alarm, language) for alarm in past.active_alarms)
         headline = f"{finding.headline} {language.text('finding.alarm', alarms=alarms)}"
-        kind = "open" if finding.kind == "sound" else finding.kind
+        kind = "open" if finding.kind in ("sound", "known") else finding.kind
         finding = finding._replace(kind=kind, headline=headline)
         cautions.insert(0, language.text("caution.alarm"))
     elif change is not None and report.view.comparison is not None:

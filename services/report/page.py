@@ -12,12 +12,13 @@ from services.common.language import ENGLISH, Language, utc_day
 from services.common.progress import Steps, no_step_progress
 from services.identification.comparison import Element
 from services.report.advice import next_steps
-from services.report.bridge import BridgeReport, reasons_of
+from services.report.bridge import BridgeReport
 from services.report.cautions import weak_before
 from services.report.evidence import evidence, facts, pictured
 from services.report.history_section import history_section, history_summary
 from services.report.html import Html, inlined_svg, joined, table, tag
 from services.report.place import start_of
+from services.report.quality import reasons_of
 from services.report.sketch import sketch
 from services.report.style import style_sheet
 from services.viewer.bridge_figure import draw_bridge
@@ -178,9 +179,14 @@ def _compared_with(report: BridgeReport, language: Language) -> str:
         return language.text("compared.baseline", name=before.name)
     dates, number = _dates(before.crossings), len(before.crossings)
     when = "days" if "last" in dates else "one" if number == 1 else "day"
-    verdict = language.text(before.verdict)
+    excluded = language.choice("compared.excluded", before.excluded) if before.excluded else ""
     return language.text(
-        f"compared.before.{when}", name=before.name, number=number, verdict=verdict, **dates
+        f"compared.before.{when}",
+        name=before.name,
+        number=number,
+        verdict=language.text(before.verdict),
+        excluded=excluded,
+        **dates,
     )
 
 

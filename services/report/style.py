@@ -19,7 +19,7 @@ ul { padding-left: 5mm; }
 .finding ul { border-top: 0.5pt solid #b9bfc5; margin: 1.5mm 0 0; padding-top: 1mm; }
 .finding.weak { border-color: #8a4b00; background: #fdf0d5; }
 .finding.sound { border-color: #00694d; background: #eef7f3; }
-.finding.open { background: #f3f5f7; }
+.finding.open, .finding.known { background: #f3f5f7; }
 .finding.doubtful { border-style: dashed; border-left-style: double; background: #f1f1f1; }
 .finding.nothing { border-style: dashed; border-color: #c0392b; background: #f6e1de; }
 table { border-collapse: collapse; width: 100%; margin: 1.5mm 0; font-size: 9pt; }

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 import driveby
+from schemas.results import load_results
 from schemas.site_file import site_toml
 from services.cli.main import main
 from services.history.validation_files import save
@@ -34,6 +35,24 @@ def test_wider_intervals_are_explained_for_one_crossing_only(
         assert main(["fuse", str(path)]) == 0
         out = " ".join(capsys.readouterr().out.split())
         assert ("single crossing: intervals include" in out) is output
+
+
+def test_element_weak_in_the_baseline_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An unchanged element at 0.6 must not read as a bridge in order."""
+    before, now = tmp_path / "before.json", tmp_path / "now.json"
+    first = write(tmp_path / "first.json", [crossing(n) for n in range(2)])
+    assert main(["fuse", str(first), "--json", str(before)]) == 0
+    second = write(tmp_path / "second.json", [crossing(n) for n in range(2, 4)])
+    capsys.readouterr()
+    assert main(["fuse", str(second), "--baseline", str(before), "--json", str(now)]) == 0
+    words = "was clearly less stiff than the others in the baseline already."
+    assert words in " ".join(capsys.readouterr().out.split())
+    finding = load_results(now).bridges["bridge-1"].finding
+    assert finding is not None
+    assert "No element has clearly changed" in finding
+    assert words in finding
 
 
 @pytest.mark.parametrize("command", ["fuse", "report"])

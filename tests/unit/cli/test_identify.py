@@ -17,7 +17,7 @@ import pytest
 from rich.console import Console
 
 from pre_core.paper.experiment import scenario_ratios
-from schemas.results import CrossingResult, Results, load_results
+from schemas.results import CrossingResult, Results, Thirds, load_results
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
 from schemas.site import Site
@@ -25,7 +25,7 @@ from schemas.site_file import parse_site, site_hash, site_toml
 from schemas.topics import Message
 from schemas.validation_records import VehicleBridgePair, pair_hash
 from services.cli import main as cli
-from services.cli.identify import identify_command, print_validation
+from services.cli.identify import _print, identify_command, print_validation
 from services.cli.settings import IdentifyOptions
 from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_lat_lon
@@ -34,6 +34,7 @@ from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.drives.settings import ImportOptions
 from services.execution.offline import site_of
 from services.history.validation_files import save
+from services.identification.comparison import describe_level
 from services.recordings.recording import read_messages, read_site
 from services.recordings.writer import write_recording
 from services.simulation.drive import (
@@ -420,6 +421,39 @@ def test_csv_files_are_refused_with_the_command_that_converts_them(
     assert f"driveby import {folder} --site SITE.toml -o DRIVE.mcap makes one" in line
     assert cli.main(["identify", str(table)]) == 2
     assert "driveby import makes one of CSV files" in capsys.readouterr().err
+
+
+def test_single_crossing_has_the_finding_and_its_level_once(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The finding states the fused level; the crossing's own is another number."""
+    site = paper_site()
+    found = results_of(site, some_crossing("a"), used="a")
+    (crossing,), (state,) = found.crossings, found.bridges.values()
+    assert state.level is not None
+    assert crossing.parameters is not None
+    assert crossing.derived is not None
+    level = crossing.parameters["EI_4"].model_copy(update={"mean": 0.91, "std": 0.05})
+    wide = crossing.parameters["EI_1"].model_copy(update={"std": 1e10})
+    derived = crossing.derived.model_copy(
+        update={"ei_level": level, "ei_thirds": Thirds(left=level, middle=level, right=level)}
+    )
+    parameters = {**crossing.parameters, "EI_1": wide}
+    crossing = crossing.model_copy(update={"parameters": parameters, "derived": derived})
+    for finding, times in ((describe_level(state.level), 0), ("No element differs clearly.", 1)):
+        shown = state.model_copy(update={"between_crossing_std": 0.02, "finding": finding})
+        bridges = {"bridge-1": shown}
+        _print(
+            Console(width=200),
+            found.model_copy(update={"crossings": (crossing,), "bridges": bridges}),
+            site,
+        )
+        out = capsys.readouterr().out
+        assert f"the bridge: {finding}\n" in out
+        assert out.count("overall stiffness: 0.91 ± 0.05 of nominal") == times
+        assert out.lower().count("overall stiffness") == 1
+        assert "not resolved: EI_1 (standard deviation above 25 %)\n" in out
+        assert "thirds of the span: 0.91" in out
 
 
 def test_bridge_without_site_validation_has_one_line(

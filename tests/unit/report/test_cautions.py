@@ -146,6 +146,23 @@ def test_element_weak_in_the_baseline_is_named(site: Site, then: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("language", "words"),
+    [
+        ("en", "No clear change; element 4 is still less stiff than the others."),
+        ("de", "Keine deutliche Änderung; Element 4 ist weiterhin weniger steif als die anderen."),
+    ],
+)
+def test_weak_element_that_has_not_changed_is_the_headline(
+    site: Site, then: Path, language: str, words: str
+) -> None:
+    files = [(Path("now.json"), changed(site, 1.0), site)]
+    (report,) = bridge_reports(files, then, language=language_of(language))
+    assert report.finding.kind == "known"
+    assert report.finding.headline.startswith(words)
+    assert list(next_steps(report, language_of(language)))
+
+
+@pytest.mark.parametrize(
     ("entry", "words"),
     [
         (0.0, None),

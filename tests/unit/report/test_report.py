@@ -18,6 +18,7 @@ from services.cli.identify import _fit_lines
 from services.common.errors import FailureError
 from services.common.language import ENGLISH, language_of
 from services.execution.fuse_results import fuse_bridge
+from services.history.validation_files import save
 from services.planning.plan_survey import SurveyWishes
 from services.report import pdf
 from services.report.advice import next_steps
@@ -25,6 +26,7 @@ from services.report.bridge import LARGEST_MISSED_LOSS, _finding, bridge_reports
 from services.report.html import Html, inlined_svg, joined, tag
 from services.report.page import page
 from services.report.place import ends_of, start_of
+from tests.builders.certificates import certificate
 from tests.builders.commands import run
 from tests.fleet import losses_of
 from tests.unit.viewer.found import RATIOS, results_of, some_crossing
@@ -170,6 +172,11 @@ def test_before_and_after_stand_beside_each_other_with_the_change(
     before, after = (
         f"{one.mean / 1e9:.2f} ({one.q025 / 1e9:.2f}–{one.q975 / 1e9:.2f})" for one in (old, new)
     )
+    left_out = some_crossing("s", verdict="suspect", reasons=("position_outage",))
+    more = (*earlier.crossings, *results_of(site, left_out).crossings)
+    then.write_text(results_json(earlier.model_copy(update={"crossings": more})))
+    words = "that measurement is good (1 other crossing is excluded)"
+    assert words in reported(site, now, baseline=then).text
     change = round(100.0 * (new.mean / old.mean - 1.0))
     assert f"4 12.9–17.1 {before} {after} −{abs(change)} % (" in found.text
     assert "Repeat the survey in the same season" not in found.text.partition("What to do")[0]
@@ -316,7 +323,7 @@ def test_several_surveys_are_fused_and_other_campaigns_are_named(site: Site) -> 
     together = fuse_bridge("bridge-1", drives.crossings)
     assert together is not None
     text = reported(site, *files).text
-    assert "6 crossings: 6 good. The numbers below combine all 6;" in text
+    assert "6 crossings: 6 good. All were simulated. The numbers below combine all 6;" in text
     assert f" {together.elements['EI_1'].mean / 1e9:.2f} " in text
     other = _in_realm(surveys[0], "sim-other")
     text = reported(site, files[0].model_copy(update={"crossings": other}), files[1]).text
@@ -858,3 +865,18 @@ def test_declared_torsion_is_no_probability(site: Site, prior: str, words: str) 
     printed = " ".join(_fit_lines(crossing))
     assert ("declared" in printed) is (prior == "log_normal")
     assert ("probability that the deck twists" in printed) is (prior == "half_normal")
+
+
+def test_quality_states_simulation_and_passed_site_validation(site: Site, tmp_path: Path) -> None:
+    found = results_of(site, some_crossing("a"), used="a")
+    (report,) = bridge_reports([(Path("x.json"), found, site)], None, validations=tmp_path)
+    assert "simulated" not in report.quality
+    crossings = tuple(one.model_copy(update={"realm": "sim-drive"}) for one in found.crossings)
+    found = found.model_copy(update={"crossings": crossings})
+    save(tmp_path, certificate(site))
+    (report,) = bridge_reports([(Path("x.json"), found, site)], None, validations=tmp_path)
+    assert "1 crossing: 1 good. It was simulated. " in report.quality
+    assert re.search(r" Site validation of truck-1: passed; \d+ of \d+ intervals", report.quality)
+    save(tmp_path, certificate(site, passed=False))
+    (report,) = bridge_reports([(Path("x.json"), found, site)], None, validations=tmp_path)
+    assert "passed" not in report.quality
