@@ -84,7 +84,7 @@ def test_tests_can_be_run_against_the_wheel(built: dict[str, Any], project: Path
 
 def test_tests_of_the_matrix_import_no_studies(project: Path) -> None:
     """Not even through other tests: `make matrix` copies no studies beside them."""
-    found = [path for name in matrix.SELECTION for path in tests_below(project / name)]
+    found = [path for name in matrix.SELECTION for path in files_below(project / name)]
     waiting = {path for path in found if str(path.relative_to(project)) not in matrix.READS_SOURCES}
     seen: set[Path] = set()
     while waiting:
@@ -97,7 +97,7 @@ def test_tests_of_the_matrix_import_no_studies(project: Path) -> None:
     assert len(seen) > 50
 
 
-def tests_below(path: Path) -> list[Path]:
+def files_below(path: Path) -> list[Path]:
     return [path] if path.is_file() else sorted(path.rglob("test_*.py"))
 
 

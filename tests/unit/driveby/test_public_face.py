@@ -623,7 +623,6 @@ ROAD = "it must be a class from A to E or a pair of arrays (x_m, height_m)"
         (lambda: driveby.simulate(scenario=6, seed=1.5), "seed is 1.5, it must be a whole number"),
         (lambda: driveby.simulate(scenario="6"), 'scenario is "6", it must be a whole number'),
         (lambda: driveby.simulate(scenario=6, noise="25"), 'noise is "25", it must be a number'),
-        (lambda: driveby.simulate(scenario=6, noise=None), "noise is None, it must be a number"),
         (lambda: driveby.simulate(scenario=6, noise=[1]), "noise is [1], it must be a number"),
         (lambda: driveby.simulate(scenario=6, speed="10"), 'speed is "10", it must be a number'),
         (lambda: driveby.simulate(scenario=6, speed=(9, 10, 11)), "or a pair (start, end)"),
