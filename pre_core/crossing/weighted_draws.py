@@ -1,6 +1,5 @@
 """Weighted draws of a density, from surrogates that are refined as draws are weighted."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -8,10 +7,8 @@ import numpy as np
 from pre_core.arrays import FloatArray
 from pre_core.crossing import surrogate
 from pre_core.search import convergence, importance
+from pre_core.search.importance import LogDensity
 from pre_core.search.loop import Report
-
-LogDensity = Callable[[FloatArray], FloatArray]
-"""Logarithm of a density (k,) at points (k, f), up to a constant."""
 
 MIN_EFFECTIVE_SHARE = 1.0 / 3.0
 """Required effective size of the draws, relative to the requested ones."""

@@ -86,8 +86,7 @@ def sample_joint(
     square of tau.
     """
     between = variability_posterior(information, priors)
-    curved = [one.likelihood.bends for one in parts if one.likelihood.bends is not None]
-    if any(bends.logarithms for bends in curved):
+    if any(one.likelihood.bends and one.likelihood.bends.logarithms for one in parts):
         parts = sorted(parts, key=lambda part: part.name)
         usual = mean_variability(between)
         of = curved_sum(parts, path_groups(parts), information, priors, usual)

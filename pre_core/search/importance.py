@@ -5,6 +5,7 @@ them. Its shape k is the test of reliability (Vehtari, Simpson, Gelman, Yao and 
 0.7).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,9 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from pre_core.arrays import FloatArray
+
+LogDensity = Callable[[FloatArray], FloatArray]
+"""Logarithm of a density (k,) at points (k, d), up to a constant."""
 
 _MAX_ROUNDS, _SAME_SCALE = 50, 1e-6
 """Limit of the rounds in which densities are scaled alike, and the change that ends them."""

@@ -13,9 +13,7 @@ import numpy as np
 
 from pre_core.arrays import FloatArray
 from pre_core.search import importance
-
-LogDensity = Callable[[FloatArray], FloatArray]
-"""Logarithm of a density (k,) at points (k, d), up to a constant."""
+from pre_core.search.importance import LogDensity
 
 _EFFECTIVE_SHARE = 0.5
 """Effective share of the draws after a step to the next density."""
