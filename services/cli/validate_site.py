@@ -18,7 +18,8 @@ from schemas.validation_records import (
 from services.common.child_process import end_with_parent
 from services.common.errors import InputError
 from services.common.files import check_writable, make_folder
-from services.common.progress import progress_bar
+from services.common.naming import count_of, processes_in_words
+from services.common.progress import progress_bar, start_line
 from services.history.validation_files import save
 from services.simulation.validation_options import CertificateOptions
 from services.simulation.validation_trial import CROSSINGS, ValidationTrial, run_trial
@@ -50,6 +51,12 @@ def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
     make_folder(asked.validations)
     for pair in pairs:
         check_writable(validation_path(asked.validations, pair_hash(known, pair, settings)))
+    trials = count_of(len(pairs), "pair")
+    start_line(
+        console,
+        f"validating {trials} of truck and bridge: at most {CROSSINGS} simulated crossings each, "
+        f"on {processes_in_words(asked.processes)}",
+    )
     have_passed = True
     # A fork is impossible: the threads of numba and OpenBLAS would not survive it.
     with (

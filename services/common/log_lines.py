@@ -13,6 +13,9 @@ from typing import Final
 SUBJECT_FIELDS: Final = ("service", "realm", "vehicle", "bridge", "crossing", "verdict")
 """Fields of a line of JSON on its subject; each is absent where it is unknown."""
 
+progress_log: Final = logging.getLogger("driveby.progress")
+"""Logger of the progress of long commands, which shows it even where only warnings are logged."""
+
 
 def about(
     *,
@@ -71,4 +74,5 @@ def configure_logging(form: str, level: int, fields: Mapping[str, str]) -> None:
         if form == "json"
         else logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s")
     )
+    progress_log.setLevel(logging.INFO)
     logging.basicConfig(level=level, handlers=[handler], force=True)

@@ -22,3 +22,8 @@ def checked_identifier(text: str, option: str) -> str:
 def count_of(number: float, noun: str) -> str:
     """Return a whole number with its noun in the right number: `1 truck`, `0 trucks`."""
     return f"{number:.0f} {noun}{'' if number == 1 else 's'}"
+
+
+def processes_in_words(number: int) -> str:
+    """Return a number of processes with its noun."""
+    return "1 process" if number == 1 else f"{number} processes"

@@ -1,13 +1,24 @@
-"""Progress bars for work that takes longer than a second or two."""
+"""Progress of work that takes longer than a second or two: a bar, or lines without a terminal.
+
+The lines are log records, which only commands show (`configure_logging`).
+"""
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
+
+from services.common.log_lines import progress_log
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
+
+_LINE_S: Final = 30.0
+"""Shortest time between two lines in s; shorter work prints none."""
+_SILENCE_S: Final = 300.0
+"""Longest time between two lines in s."""
 
 Offset = Callable[[int], object]
 """Callback with the number of bytes read from a file."""
@@ -34,10 +45,22 @@ def no_step_progress(done: int, steps: int) -> None:
 
 
 def progress_bar(console: "Console") -> "Progress":
-    """Return a bar with a description and the remaining time; invisible without a terminal."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    """Return a bar with a description and the remaining time; without a terminal, sparse lines."""
+    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-    return Progress(
+    class BarOrLines(Progress):
+        """Bar on a terminal, lines elsewhere."""
+
+        lines = _SparseLines()
+
+        def update(self, task_id: TaskID, *args: Any, **kwargs: Any) -> None:
+            """Update a task and, without a terminal, log a line if one is due."""
+            super().update(task_id, *args, **kwargs)
+            if self.disable:
+                task = self.tasks[self.task_ids.index(task_id)]
+                self.lines.add(task.description, task.completed, task.total)
+
+    return BarOrLines(
         TextColumn("{task.description}"),
         BarColumn(),
         TimeRemainingColumn(),
@@ -47,15 +70,49 @@ def progress_bar(console: "Console") -> "Progress":
     )
 
 
+class _SparseLines:
+    """Lines on the progress of one piece of work: more time between them the longer it takes."""
+
+    def __init__(self) -> None:
+        self._began = self._last = time.monotonic()
+
+    def add(self, description: str, completed: float, total: float | None) -> None:
+        """Log the completed part of the work unless the last line is recent."""
+        now = time.monotonic()
+        passed_s = now - self._began
+        if now - self._last < min(_SILENCE_S, max(_LINE_S, 0.1 * passed_s)):
+            return
+        self._last = now
+        share = f", {100.0 * completed / total:.0f} %" if total else ""
+        progress_log.info("%s%s after %.0f s", description, share, passed_s)
+
+
+def start_line(console: "Console", line: str) -> None:
+    """Log what starts and how much it is, where there is no terminal for a bar."""
+    if not console.is_terminal:
+        progress_log.info("%s", line)
+
+
 @contextlib.contextmanager
-def steps_bar(description: str, console: "Console | None" = None) -> Iterator[Steps]:
-    """Yield a callback for a bar over steps of equal duration; on standard error by default."""
+def steps_bar(
+    description: str, console: "Console | None" = None, start: str | None = None
+) -> Iterator[Steps]:
+    """Yield a callback for a bar over steps of equal duration; on standard error by default.
+
+    Without a terminal the first call logs the line `start`, whose `{steps}` are those still to do.
+    """
     from rich.console import Console
 
-    with progress_bar(console or Console(stderr=True)) as bar:
+    console = console or Console(stderr=True)
+    with progress_bar(console) as bar:
         task = bar.add_task(description, total=None)
+        line = start
 
         def show(done: int, steps: int) -> None:
+            nonlocal line
+            if line is not None:
+                start_line(console, line.format(steps=steps - done))
+                line = None
             bar.update(task, completed=done, total=max(1, steps))
 
         yield show

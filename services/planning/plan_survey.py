@@ -1,10 +1,10 @@
 """Forecast of a survey of a site's first bridge by its first truck, from a few wishes."""
 
-from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from schemas.site import Site
 from services.common.errors import InputError
+from services.common.progress import Steps
 from services.finding.placed import middle_site
 from services.planning.alternatives import with_noise, with_tyres
 from services.planning.crossings import PlannedRoad
@@ -28,9 +28,7 @@ class SurveyWishes(NamedTuple):
     wander_m: float = 0.12
 
 
-def plan_survey(
-    given: Site, wishes: SurveyWishes, report: Callable[[int, int], None]
-) -> SurveyForecast:
+def plan_survey(given: Site, wishes: SurveyWishes, report: Steps) -> SurveyForecast:
     """Return the forecast; `report` receives the finished and all jobs.
 
     Raise InputError for a tandem without load equalisation.

@@ -18,6 +18,7 @@ from pre_core.survey.plan import (
 from schemas.site import Bridge, Site
 from services.common.arrays import Floats
 from services.common.errors import FailureError
+from services.common.progress import Steps, no_step_progress
 from services.planning.alternatives import Plan, alternatives, as_planned
 from services.planning.crossings import CrossingSimulator, PlannedCrossing, PlannedRoad, scale_error
 
@@ -99,13 +100,14 @@ def forecast_survey(
     site: Site,
     road: PlannedRoad,
     question: SurveyQuestion,
-    progress: Callable[[int, int], None] = lambda done, jobs: None,
+    progress: Steps = no_step_progress,
 ) -> SurveyForecast:
     """Forecast a survey of the site's first bridge with its first truck."""
     simulated = CrossingSimulator(road)
     plans = list(alternatives(site, question.speed_m_per_s))
     speeds = _speeds(question)
     jobs = 2 + len(plans) + len(speeds)
+    progress(0, jobs)
     planned = _forecast_of(simulated, as_planned(site, question.speed_m_per_s), question)
     progress(1, jobs)
     others = []

@@ -7,7 +7,8 @@ import numpy as np
 
 from pre_core.search import loop
 from services.common.files import check_writable, make_folder, write_atomically
-from services.common.progress import progress_bar
+from services.common.naming import count_of
+from services.common.progress import progress_bar, start_line
 from services.simulation.validation_options import ScenarioOptions
 from studies.paper.scenarios import Scenario, compare_with_paper, models, run_scenario
 from studies.paper.tables import accuracy_of_paper, of_paper, tables_of_paper
@@ -45,6 +46,8 @@ def run(asked: ScenarioOptions, console: "Console") -> int:
 
 def _run_scenarios(asked: ScenarioOptions, console: "Console") -> list[Scenario]:
     car, sound = models(asked.site)
+    number, steps = len(asked.scenarios), asked.steps
+    start_line(console, f"searching in {count_of(number, 'scenario')}, {steps} steps each")
     with progress_bar(console) as progress:
         task = progress.add_task("starting", total=len(asked.scenarios) * (asked.steps + 1))
         return [

@@ -152,7 +152,7 @@ def one_crossing(
 def in_processes(
     jobs: Sequence[Callable[[], Record]],
     processes: int,
-    progress: Callable[[Record], None] = lambda line: None,
+    progress: Callable[[Record], object] = lambda line: None,
 ) -> list[Record]:
     """Return the records of all jobs, in their order; each process runs one at a time.
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from schemas.settings import IdentificationSettings
 from schemas.site_file import load_site
 from services.common.files import check_writable, make_folder, write_atomically
-from services.common.progress import progress_bar
+from services.common.progress import steps_bar
 from services.finding.placed import middle_site
 from services.simulation.validation_options import IntervalOptions
 from studies.simulation.truths import default_site
@@ -23,7 +23,14 @@ from studies.validation.uncertainty import (
     run_parts,
     scenario_rows,
 )
-from studies.validation.worlds import HEADINGS, cells, lines_of, read_records, run_worlds
+from studies.validation.worlds import (
+    HEADINGS,
+    cells,
+    crossings_start,
+    lines_of,
+    read_records,
+    run_worlds,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -65,8 +72,8 @@ def run(asked: IntervalOptions, console: "Console") -> int:
 
 def _outcome(asked: IntervalOptions, console: "Console") -> ValidationOutcome:
     known = default_site() if asked.site is None else middle_site(load_site(asked.site))
-    with progress_bar(console) as bar:
-        task = bar.add_task("crossings", total=None)
+    start = crossings_start(asked.processes)
+    with steps_bar("crossings", console, start) as progress:
         outcome = run_parts(
             known,
             crossings=asked.crossings,
@@ -74,22 +81,21 @@ def _outcome(asked: IntervalOptions, console: "Console") -> ValidationOutcome:
             scenarios=asked.scenarios,
             folder=asked.truth,
             processes=asked.processes,
-            progress=lambda done, jobs: bar.update(task, completed=done, total=jobs),
+            progress=progress,
         )
-        if not asked.out_of_model:
-            return outcome
-        task = bar.add_task("crossings with more physics", total=None)
-        return outcome._replace(
-            worlds=run_worlds(
-                known,
-                asked.effects,
-                asked.out_of_model,
-                asked.records,
-                IdentificationSettings(method="pre", threads=1),
-                asked.processes,
-                lambda done, jobs: bar.update(task, completed=done, total=jobs),
-            )
+    if not asked.out_of_model:
+        return outcome
+    with steps_bar("crossings with more physics", console, start) as progress:
+        worlds = run_worlds(
+            known,
+            asked.effects,
+            asked.out_of_model,
+            asked.records,
+            IdentificationSettings(method="pre", threads=1),
+            asked.processes,
+            progress,
         )
+    return outcome._replace(worlds=worlds)
 
 
 def print_outcome(console: "Console", outcome: ValidationOutcome, all_checks: list[Aim]) -> None:

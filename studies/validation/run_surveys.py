@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING
 
 from schemas.site_file import load_site
 from services.common.files import make_folder
-from services.common.progress import progress_bar, steps_bar
+from services.common.progress import steps_bar
 from services.finding.placed import middle_site
 from services.simulation.validation_options import SurveyOptions
 from studies.simulation.truths import default_site
 from studies.validation import detection
 from studies.validation.forecasts import forecasts_of
 from studies.validation.surveys import HEADINGS, fused_surveys, rows, run_surveys, survey_checks
-from studies.validation.worlds import read_records
+from studies.validation.worlds import crossings_start, read_records
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -28,15 +28,9 @@ def run(asked: SurveyOptions, console: "Console") -> int:
     read_records(asked.records)
     make_folder(asked.records.parent)
     known = default_site() if asked.site is None else middle_site(load_site(asked.site))
-    with progress_bar(console) as bar:
-        task = bar.add_task("crossings", total=None)
+    with steps_bar("crossings", console, crossings_start(asked.processes)) as progress:
         found = run_surveys(
-            known,
-            asked.kinds,
-            asked.surveys,
-            asked.records,
-            asked.processes,
-            lambda done, jobs: bar.update(task, completed=done, total=jobs),
+            known, asked.kinds, asked.surveys, asked.records, asked.processes, progress
         )
     with steps_bar("fusing", console) as progress:
         fused = fused_surveys(found, progress=progress)

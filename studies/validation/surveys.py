@@ -8,7 +8,7 @@ recording, then all of a survey are fused, as in a worker.
 Records are stored as in `studies.validation.worlds`: existing ones are not simulated again.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -207,7 +207,7 @@ def run_surveys(
     surveys: int,
     path: Path,
     processes: int,
-    progress: Callable[[int, int], None] = lambda done, jobs: None,
+    progress: Steps = no_step_progress,
 ) -> list[Record]:
     """Return crossings of some surveys of each kind; simulate those that `path` lacks."""
     settings = IdentificationSettings(method="pre", threads=1)

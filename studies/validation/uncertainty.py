@@ -21,6 +21,7 @@ from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.site_file import load_site
 from services.common.errors import InputError
+from services.common.progress import Steps, no_step_progress
 from services.drives.csv_import import read_folder
 from services.drives.runs import normalised
 from services.simulation.drawn import IdentifiedCrossing, identify_simulated
@@ -91,7 +92,7 @@ def run_parts(
     scenarios: Sequence[int],
     folder: Path,
     processes: int,
-    progress: Callable[[int, int], None] = lambda done, jobs: None,
+    progress: Steps = no_step_progress,
 ) -> ValidationOutcome:
     """Run the parts in a number of processes of one thread each.
 
@@ -116,6 +117,7 @@ def run_parts(
     found: dict[str, list[Record]] = {}
     everything = [job for jobs in parts.values() for job in jobs]
     done = count(1)
+    progress(0, len(everything))
     lines = in_processes(everything, processes, lambda line: progress(next(done), len(everything)))
     begin = 0
     for name, jobs in parts.items():

@@ -19,6 +19,8 @@ from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.site_file import site_hash
 from services.common.errors import InputError
+from services.common.naming import processes_in_words
+from services.common.progress import Steps, no_step_progress
 from services.recordings.recording import program_version
 from services.simulation.drawn import identify_simulated
 from services.simulation.effects import SURFACE
@@ -112,6 +114,11 @@ def identity_of(site: Site, settings: IdentificationSettings) -> str:
     return f"{program_version()} {site_hash(site)} {settings.model_dump_json()}"
 
 
+def crossings_start(processes: int) -> str:
+    """Return the start line of a study for `steps_bar`."""
+    return f"validating {{steps}} simulated crossings on {processes_in_words(processes)}"
+
+
 def run_worlds(
     site: Site,
     effects: Sequence[str],
@@ -119,7 +126,7 @@ def run_worlds(
     path: Path,
     settings: IdentificationSettings,
     processes: int,
-    progress: Callable[[int, int], None] = lambda done, jobs: None,
+    progress: Steps = no_step_progress,
 ) -> list[Record]:
     """Return the records of seeds 0 to crossings - 1 of these effects; run missing ones."""
     wanted = [(effect, seed) for seed in range(crossings) for effect in effects]
@@ -147,7 +154,7 @@ def completed(
     key_of: Callable[[Record], KeyT],
     job_of: Callable[[KeyT], Callable[[], Record]],
     processes: int,
-    progress: Callable[[int, int], None],
+    progress: Steps,
 ) -> list[Record]:
     """Return the wanted records; compute those that are not `known` and append them to `path`."""
     missing = [key for key in wanted if key not in known]

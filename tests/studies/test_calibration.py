@@ -2,6 +2,7 @@
 
 import copy
 import io
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ from scipy.special import ndtr
 from pre_core.constants import NORMAL_975
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
+from services.common.log_lines import progress_log
 from services.simulation.drawn import IdentifiedCrossing, draw_truth, drive
 from services.simulation.validation_options import IntervalOptions
 from studies.simulation.truths import default_site
-from studies.validation import calibration, run_intervals
+from studies.validation import calibration, run_intervals, uncertainty
 from studies.validation.calibration import (
     GROUPS,
     Aim,
@@ -31,6 +33,7 @@ from studies.validation.page import validation_page
 from studies.validation.run_intervals import print_outcome
 from studies.validation.uncertainty import (
     HALF,
+    SCENARIO_NOISE_UG,
     ValidationOutcome,
     aims,
     control_checks,
@@ -303,3 +306,32 @@ def test_the_command_ends_with_1_where_an_aim_is_missed(
         page=None,
     )
     assert run_intervals.run(asked, Console(file=io.StringIO(), width=80)) == code
+
+
+def test_study_announces_its_crossings_before_the_first(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    caplog.set_level(logging.INFO, progress_log.name)
+    monkeypatch.setattr(uncertainty, "in_processes", _stopped)
+    asked = IntervalOptions(
+        crossings=40,
+        control=5,
+        scenarios=(12,),
+        out_of_model=0,
+        effects=(),
+        records=Path("unused"),
+        truth=tmp_path,
+        site=None,
+        processes=2,
+        json=None,
+        figures=None,
+        page=None,
+    )
+    with pytest.raises(KeyboardInterrupt):
+        run_intervals.run(asked, Console(file=io.StringIO(), width=80))
+    noises = len(SCENARIO_NOISE_UG)
+    assert caplog.messages == [f"validating {45 + noises} simulated crossings on 2 processes"]
+
+
+def _stopped(*_: object) -> None:
+    raise KeyboardInterrupt

@@ -81,7 +81,7 @@ def _survey(options: SurveyPlanOptions) -> int:
     from schemas.site_file import load_site
     from services.common.errors import InputError
     from services.common.files import check_writable, write_atomically
-    from services.common.progress import progress_bar
+    from services.common.progress import steps_bar
     from services.finding.placed import sensor_rows, sensors_in_words
     from services.planning.forecast_text import as_json, lines_of
     from services.planning.plan_survey import SurveyWishes, plan_survey
@@ -102,11 +102,12 @@ def _survey(options: SurveyPlanOptions) -> int:
         options.noise,
         options.wander,
     )
-    with progress_bar(a_console()) as bar:
-        task = bar.add_task("crossings", total=None)
-        found = plan_survey(
-            given, wishes, lambda done, jobs: bar.update(task, completed=done, total=jobs)
-        )
+    start = (
+        f"forecasting {options.crossings} crossings of {given.bridges[0].id} by "
+        f"{given.vehicles[0].id} and the alternatives: {{steps}} plans"
+    )
+    with steps_bar("plans", a_console(), start) as progress:
+        found = plan_survey(given, wishes, progress)
     if options.json is not None:
         rows = sensor_rows(given.sensor, given.vehicles[0])
         sensors = {"sensors": [row._asdict() for row in rows]} if rows else {}

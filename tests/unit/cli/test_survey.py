@@ -32,7 +32,8 @@ def test_a_plan_of_the_example(
     found, picture = tmp_path / "plan.json", tmp_path / "plan.png"
     arguments = ["survey", "--site", str(project / "docs/site.example.toml"), "--speed", "10"]
     assert cli.main([*arguments, "--json", str(found), "--figure", str(picture)]) == 0
-    out = capsys.readouterr().out
+    out, errors = capsys.readouterr()
+    assert "forecasting 12 crossings of bridge-1 by truck-1 and the alternatives: 10 p" in errors
     assert "t: only if legal axle and total loads allow it" in out  # no mass is known to be legal
     plan = json.loads(found.read_text(encoding="utf-8"))
     assert picture.stat().st_size > 10_000

@@ -93,6 +93,17 @@ def test_line_names_the_road_only_where_both_axles_share_it(
     assert "one road profile" not in line
 
 
+def test_validation_announces_pairs_and_processes(
+    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "certificates"
+    assert validate("--site", site, "--validations", folder, "--processes", 1) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith(
+        "validating 4 pairs of truck and bridge: at most 12 simulated crossings each, on 1 process"
+    )
+
+
 def test_one_pair_may_be_asked_for(
     site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

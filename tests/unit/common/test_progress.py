@@ -1,6 +1,7 @@
-"""Bars: what they receive, and that they are seen on a terminal only."""
+"""Bars: what they receive, and that there are sparse lines instead without a terminal."""
 
 import io
+import logging
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from rich.console import Console
 from schemas.settings import IdentificationSettings
 from schemas.site_file import load_site
 from services.catalogue.contents import summarise_recording
+from services.common.log_lines import configure_logging, progress_log
 from services.common.progress import parts_bar, reading_bar, steps_bar
 from services.drives.importing import import_command
 from services.drives.settings import ImportOptions
@@ -74,6 +76,55 @@ def test_nothing_is_seen_where_there_is_no_terminal(tmp_path: Path) -> None:
     with reading_bar("reading", [tmp_path / "missing"], Console(file=shown)) as next_file:
         next_file()(10)
     assert shown.getvalue() == ""
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Return the time of the bars in s, the only item of a list."""
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    return now
+
+
+def test_steps_without_a_terminal_are_a_start_and_sparse_lines(
+    clock: list[float], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, progress_log.name)
+    start = "validating {steps} crossings"
+    with steps_bar("crossings", Console(file=io.StringIO()), start) as progress:
+        progress(5, 205)
+        assert caplog.messages == ["validating 200 crossings"]
+        for done in range(6, 206):
+            clock[0] += 20.0
+            progress(done, 205)
+    begin, *lines = caplog.messages
+    assert begin == "validating 200 crossings"
+    assert lines[:2] == ["crossings, 3 % after 40 s", "crossings, 4 % after 80 s"]
+    assert 20 < len(lines) < 40  # of 4000 s
+
+
+def test_steps_on_a_terminal_write_no_lines(
+    clock: list[float], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, progress_log.name)
+    terminal = Console(file=io.StringIO(), force_terminal=True, width=80, color_system=None)
+    with steps_bar("crossings", terminal, "validating {steps} crossings") as progress:
+        clock[0] += 100.0
+        progress(1, 2)
+    assert caplog.messages == []
+
+
+def test_commands_log_progress_and_otherwise_warnings(capsys: pytest.CaptureFixture[str]) -> None:
+    before = logging.getLogger().handlers[:], logging.getLogger().level, progress_log.level
+    try:
+        configure_logging("text", logging.WARNING, {})
+        progress_log.info("crossings, 3 %% after %d s", 40)
+        logging.getLogger("other").info("detail")
+    finally:
+        logging.getLogger().handlers[:], logging.getLogger().level = before[:2]
+        progress_log.setLevel(before[2])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("INFO driveby.progress: crossings, 3 % after 40 s")
 
 
 def test_steps_are_a_bar_with_the_time_that_is_left() -> None:
