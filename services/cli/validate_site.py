@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from schemas.settings import IdentificationSettings
-from schemas.site import Site
+from schemas.site import Site, Vehicle
 from schemas.site_file import load_site
 from schemas.validation_records import (
     ValidationRecord,
@@ -33,11 +33,8 @@ _AFTER_FAILURE: Final = (
     "another truck, and validate again"
 )
 
-
-_ONE_PROFILE: Final = (
-    " on one road profile under both axles, so real crossings are less accurate (to simulate two, "
-    "declare twin_tyre_distance_m or rear_axle_offset_m)"
-)
+_UNLIKE_PATHS: Final = ("twin_tyre_distance_m", "rear_axle_offset_m")
+"""Keys of a vehicle whose axles do not follow the same path."""
 
 
 def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
@@ -71,7 +68,7 @@ def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
             certificate = trial.certificate(time.time())
             path = save(asked.validations, certificate)
             have_passed &= certificate.passed
-            console.print(line_of(certificate, path), highlight=False, soft_wrap=True)
+            console.print(line_of(certificate, path, known), highlight=False, soft_wrap=True)
     if not have_passed:
         console.print(_AFTER_FAILURE, highlight=False, soft_wrap=True)
     return 0 if have_passed else 1
@@ -95,12 +92,22 @@ def _pairs(known: Site, asked: CertificateOptions) -> list[VehicleBridgePair]:
     ]
 
 
-def line_of(certificate: ValidationRecord, path: Path) -> str:
-    """Return a validation record in one line."""
+def line_of(certificate: ValidationRecord, path: Path, known: Site) -> str:
+    """Return a validation record of a site's pair in one line."""
     figures = certificate.figures
     how = "passed" if certificate.passed else "FAILED"
     fewer = "" if figures.crossings == CROSSINGS else f" (of {CROSSINGS}, the rest not needed)"
     std = "" if figures.std is None else f"; EI ± {100.0 * figures.std:.0f} %"
     if std and certificate.conditions.road == "groove":
-        std += _ONE_PROFILE
+        std += _one_profile(known.vehicle(certificate.vehicle))
     return f"{certificate.pair}: {how}{fewer}: {certificate.reason}{std}; {path}"
+
+
+def _one_profile(vehicle: Vehicle) -> str:
+    """Return the caution on a trial whose axles follow one profile, and what may be declared."""
+    undeclared = [key for key in _UNLIKE_PATHS if getattr(vehicle, key) is None]
+    two = f"; to simulate two, declare {' or '.join(undeclared)}" if undeclared else ""
+    return (
+        " on one road profile under both axles, so real crossings are less accurate (driveby "
+        f"survey forecasts how accurate{two})"
+    )

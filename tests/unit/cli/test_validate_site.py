@@ -93,6 +93,31 @@ def test_line_names_the_road_only_where_both_axles_share_it(
     assert "one road profile" not in line
 
 
+@pytest.mark.parametrize(
+    ("declared", "two"),
+    [
+        ({}, "; to simulate two, declare twin_tyre_distance_m or rear_axle_offset_m)"),
+        ({"twin_tyre_distance_m": (0.0, 0.0)}, "; to simulate two, declare rear_axle_offset_m)"),
+        ({"twin_tyre_distance_m": (0.0, 0.0), "rear_axle_offset_m": 0.0}, ")"),
+    ],
+)
+def test_line_names_only_paths_that_are_not_declared(
+    site: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    declared: dict[str, Any],
+    two: str,
+) -> None:
+    known = load_site(site)
+    truck = known.vehicles[0].model_copy(update=declared)
+    path = tmp_path / "single_tyres.toml"
+    path.write_text(site_toml(known.model_copy(update={"vehicles": (truck,)})))
+    folder = tmp_path / "certificates"
+    assert validate("--site", path, "--validations", folder, "--bridge", "bridge-1") == 0
+    line = capsys.readouterr().out
+    assert f"are less accurate (driveby survey forecasts how accurate{two}; " in line
+
+
 def test_validation_announces_pairs_and_processes(
     site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
