@@ -34,13 +34,16 @@ _SOUND = experiment.beam(np.ones(experiment.ELEMENTS))
 
 
 def main(*, strict: bool = False) -> int:
-    """Compile missing kernels and print one line; return 0, or 1 on failure if `strict`.
+    """Compile missing kernels, print begin and end; return 0, or 1 on failure if `strict`.
 
     An image is built with `strict`: otherwise every start of a container would compile again.
     """
     began = time.perf_counter()
     try:
         _remove_stale(PACKAGE)
+        if not any(PACKAGE.rglob("__pycache__/*.nbi")):
+            sys.stdout.write("compiling kernels, about a minute, once\n")
+            sys.stdout.flush()
         warm_up()
         _warm_up_validation()
     except Exception as error:  # noqa: BLE001, RUF100 - see the module's docstring

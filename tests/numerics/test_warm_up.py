@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from services.execution import warm_up
+
 # In a process of its own: here other tests may have compiled what the warm-up forgets.
 IDENTIFY = """
 import gc, json, sys
@@ -67,6 +69,31 @@ def counted(problem, y):
 real, posterior.all_rows = posterior.all_rows, counted
 warm_up.warm_up()
 """
+
+
+@pytest.mark.parametrize("is_compiled", [False, True])
+def test_warm_up_announces_only_a_compilation(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    *,
+    is_compiled: bool,
+) -> None:
+    (tmp_path / "kernel.py").touch()
+    if is_compiled:
+        (tmp_path / "__pycache__").mkdir()
+        (tmp_path / "__pycache__" / "kernel.nbi").touch()
+
+    def compile_kernels() -> None:
+        printed.append(capsys.readouterr().out)
+
+    printed: list[str] = []
+    monkeypatch.setattr(warm_up, "PACKAGE", tmp_path)
+    monkeypatch.setattr(warm_up, "warm_up", compile_kernels)
+    monkeypatch.setattr(warm_up, "_warm_up_validation", lambda: None)
+    assert warm_up.main() == 0
+    assert printed == ["" if is_compiled else "compiling kernels, about a minute, once\n"]
+    assert capsys.readouterr().out.startswith("kernels compiled (")
 
 
 @pytest.mark.slow
