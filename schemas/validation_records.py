@@ -23,6 +23,10 @@ METHOD_EDITION: Final = 6
 earlier validation records become void. It is independent of the program's version, because most
 versions leave the method unchanged and it may change between two versions."""
 
+LEAST_COVERAGE: Final = 0.85
+"""Smallest coverage of all 95 % intervals that passes. Those of one crossing are dependent: see
+studies/site-validation.md."""
+
 _NOT_OF_A_CERTIFICATE: Final = NOT_OF_THE_RESULT | {"seed"}
 """Settings that do not change the method. The seed is chance, which the validation itself varies.
 """
@@ -112,6 +116,11 @@ class ValidationFigures(StrictModel):
     """Number of those whose interval of the weak element lies below 0.9 of nominal."""
     evaluations: int
     """Number of model evaluations in all crossings."""
+
+    @property
+    def most_missed(self) -> int:
+        """Largest number of the intervals that may miss the truth."""
+        return int((1.0 - LEAST_COVERAGE) * self.intervals + 1e-9)
 
 
 class ValidationRecord(StrictModel):

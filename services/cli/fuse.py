@@ -13,7 +13,11 @@ from services.common.files import check_writable, write_atomically
 from services.common.options import validations_folder
 from services.common.progress import Steps, parts_bar, steps_bar
 from services.execution.fuse_results import crossings_to_fuse, fuse_crossings
-from services.history.validation_files import check_validations, pairs_without_validation
+from services.history.validation_files import (
+    check_validations,
+    pairs_with_intervals,
+    pairs_without_validation,
+)
 from services.ledger.site_of_results import site_of_results
 
 if TYPE_CHECKING:
@@ -63,16 +67,15 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
 def _print_validations(
     console: "Console", newest: Path, fused: Results, asked: FuseOptions
 ) -> None:
-    """Print which intervals no passed site validation covers, as far as a site file is known."""
-    pairs = pairs_without_validation(fused.crossings)
-    if not pairs:
+    """Print which site validations cover the intervals, as far as a site file is known."""
+    if not pairs_with_intervals(fused.crossings):
         return
     try:
         site = site_of_results(newest, fused, asked.site)
     except InputError:
         if asked.site is not None:
             raise
-        for pair in pairs:
+        for pair in pairs_without_validation(fused.crossings):
             console.print(
                 f"{pair}: the results name no passed site validation; "
                 "with --site SITE.toml it is looked up",

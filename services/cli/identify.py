@@ -47,10 +47,9 @@ from services.execution.offline import identify_drives, messages_of_trucks, site
 from services.finding.order import index_messages
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
 from services.history.validation_files import (
+    ValidatedPairs,
     check_validations,
-    pairs_without_validation,
     passed_validations,
-    validation_notes,
 )
 from services.identification.bridge_state import FusionSettings
 from services.identification.comparison import baseline_cautions
@@ -278,10 +277,10 @@ def _print(console: "Console", found: Results, site: Site) -> None:
 
 
 def print_validation(console: "Console", found: Results, site: Site, folder: Path) -> None:
-    """Print which intervals no passed site validation covers, once for a bridge."""
+    """Print which site validations cover the intervals, and which are missing, by bridge."""
+    pairs = ValidatedPairs(found.crossings)
     for bridge in dict.fromkeys(crossing.bridge for crossing in found.crossings):
-        crossed = (crossing for crossing in found.crossings if crossing.bridge == bridge)
-        for note in validation_notes(folder, site, pairs_without_validation(crossed)):
+        for note in pairs.notes(folder, site, bridge):
             console.print(f"[bold]{bridge}:[/] {note}", highlight=False, soft_wrap=True)
 
 

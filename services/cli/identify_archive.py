@@ -1,8 +1,8 @@
 """The command `driveby identify --into DIR`: an archive of recordings, stored as computed."""
 
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +11,6 @@ from schemas.results import CrossingResult, ResultHeader, results, results_json
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.site_file import load_site, parse_site
-from schemas.validation_records import VehicleBridgePair
 from services.catalogue.index import update_catalog
 from services.catalogue.positions import crossings_of
 from services.cli.bridge_table import print_bridge
@@ -33,10 +32,9 @@ from services.execution.dispatch import CrossingExecutor
 from services.execution.inline import InlineExecutor
 from services.execution.result_store import BRIDGES, ResultStore
 from services.history.validation_files import (
+    ValidatedPairs,
     check_validations,
-    pairs_without_validation,
     passed_validations,
-    validation_notes,
 )
 from services.identification.bridge_state import FusionSettings, with_common_shares
 from services.ledger.baselines import baselines_of
@@ -87,24 +85,20 @@ def archive_command(
         ),
         passed_validations(folder, known, settings),
     )
-    kept = ResultStore(into)
     crossings: list[CrossingResult] = []
-    unvalidated: defaultdict[str, set[VehicleBridgePair]] = defaultdict(set)
+    pairs = ValidatedPairs()
 
     def take(crossing: CrossingResult) -> None:
-        unvalidated[crossing.bridge].update(pairs_without_validation([crossing]))
+        pairs.add(crossing)
         if json_path is not None:
             crossings.append(crossing)
-
-    def notes_of(bridge: str) -> Iterator[str]:
-        return validation_notes(folder, known, sorted(unvalidated[bridge]))
 
     with executing as execution, progress_bar(console) as bar:
         task = bar.add_task("crossings", total=None)
         found = identify_archive(
             asked,
             InlineExecutor() if execution is None else execution,
-            kept,
+            ResultStore(into),
             on_result=take,
             report=lambda number: bar.update(task, description=count_of(number, "crossing")),
         )
@@ -114,6 +108,7 @@ def archive_command(
     if json_path is not None:
         crossings.sort(key=lambda one: (one.entry_time, one.crossing_id))
         _write(json_path, header, with_common_shares(crossings, found.bridges), found)
+    notes_of = partial(pairs.notes, folder, known)
     return _print_summary(found, notes_of, [*problems, *found.problems], known, into, console)
 
 

@@ -1,6 +1,7 @@
 """Validation records of a folder: writing them, the passed ones, and what is not validated."""
 
 import logging
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.validation_records import (
+    LEAST_COVERAGE,
     ValidationRecord,
     VehicleBridgePair,
     load_validation,
@@ -56,14 +58,19 @@ def passed_validations(
     return found
 
 
-def pairs_without_validation(crossings: Iterable[CrossingResult]) -> list[VehicleBridgePair]:
-    """Return the pairs of results with intervals that name no validation record, each once."""
+def pairs_with_intervals(crossings: Iterable[CrossingResult]) -> list[VehicleBridgePair]:
+    """Return the pairs of results with intervals, each once."""
     pairs = (
         VehicleBridgePair(one.vehicle, one.bridge)
         for one in crossings
-        if one.certificate is None and one.method == "pre" and one.parameters is not None
+        if one.method == "pre" and one.parameters is not None
     )
     return list(dict.fromkeys(pairs))
+
+
+def pairs_without_validation(crossings: Iterable[CrossingResult]) -> list[VehicleBridgePair]:
+    """Return the pairs of results with intervals that name no validation record, each once."""
+    return pairs_with_intervals(one for one in crossings if one.certificate is None)
 
 
 def validation_notes(
@@ -88,17 +95,17 @@ def validation_notes(
                 crossings=figures.crossings,
                 covered=figures.covered,
                 intervals=figures.intervals,
+                least=100.0 * LEAST_COVERAGE,
             )
     if untried:
         yield language.text("caution.unvalidated", trucks=language.listed(untried))
 
 
 def validations_passed(
-    folder: Path, site: Site, crossings: Iterable[CrossingResult], language: Language = ENGLISH
+    folder: Path, site: Site, pairs: Iterable[VehicleBridgePair], language: Language = ENGLISH
 ) -> Iterator[str]:
-    """Yield a sentence for each pair of the crossings whose validation record has passed."""
-    pairs = (VehicleBridgePair(one.vehicle, one.bridge) for one in crossings if one.method == "pre")
-    for pair in dict.fromkeys(pairs):
+    """Yield a sentence for each pair whose validation record has passed."""
+    for pair in pairs:
         record = _record_of(folder, site, pair)
         if record is not None and record.passed:
             figures = record.figures
@@ -107,7 +114,29 @@ def validations_passed(
                 truck=pair.vehicle,
                 covered=figures.covered,
                 intervals=figures.intervals,
+                least=figures.intervals - figures.most_missed,
             )
+
+
+class ValidatedPairs:
+    """Pairs of results with intervals, by bridge, for the sentences on their validations."""
+
+    def __init__(self, crossings: Iterable[CrossingResult] = ()) -> None:
+        """Collect the pairs of these results."""
+        self._pairs: defaultdict[str, set[VehicleBridgePair]] = defaultdict(set)
+        self._unvalidated: defaultdict[str, set[VehicleBridgePair]] = defaultdict(set)
+        for crossing in crossings:
+            self.add(crossing)
+
+    def add(self, crossing: CrossingResult) -> None:
+        """Add the pair of a result."""
+        self._pairs[crossing.bridge].update(pairs_with_intervals([crossing]))
+        self._unvalidated[crossing.bridge].update(pairs_without_validation([crossing]))
+
+    def notes(self, folder: Path, site: Site, bridge: str) -> Iterator[str]:
+        """Yield the sentences on the pairs of a bridge: failed, untried, passed."""
+        yield from validation_notes(folder, site, sorted(self._unvalidated[bridge]))
+        yield from validations_passed(folder, site, sorted(self._pairs[bridge]))
 
 
 def _record_of(folder: Path, site: Site, pair: VehicleBridgePair) -> ValidationRecord | None:

@@ -16,6 +16,7 @@ from services.common.options import CERTIFICATES
 from services.execution.blas import one_blas_thread
 from services.history.bridge_history import BridgeHistory
 from services.history.validation_files import (
+    pairs_with_intervals,
     pairs_without_validation,
     validation_notes,
     validations_passed,
@@ -146,7 +147,7 @@ def _report(
     combined = None if before is not None else combined_surveys(_survey_files(name, about), used)
     pairs = pairs_without_validation(used)
     notes = tuple(validation_notes(validations, site, pairs, language))
-    passed = validations_passed(validations, site, used, language)
+    passed = validations_passed(validations, site, pairs_with_intervals(used), language)
     basis = CautionBasis(bridge, view, used, before, combined, notes)
     return BridgeReport(
         bridge,

@@ -25,6 +25,7 @@ from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Site, Vehicle
 from schemas.validation_records import (
+    LEAST_COVERAGE,
     METHOD_EDITION,
     ValidationConditions,
     ValidationCrossing,
@@ -50,9 +51,6 @@ FEWEST: Final = 8
 """Fewest crossings after which a trial without objection may pass."""
 FEWEST_GOOD: Final = 8
 """Fewest `good` crossings of all; below, the method is too rarely certain of its answer."""
-LEAST_COVERAGE: Final = 0.85
-"""Smallest coverage of all 95 % intervals. Those of one crossing are dependent: see
-studies/site-validation.md."""
 LARGEST_RMS_Z: Final = 1.5
 LARGEST_Z_GOOD: Final = 5.0
 """Largest standardised error of a `good` crossing, as in docs/validation.md."""
@@ -438,8 +436,7 @@ def _why_not(tried: Sequence[ValidationCrossing]) -> str:
 
 def _for(tried: Sequence[ValidationCrossing], figures: ValidationFigures) -> str:
     """Return the figures of a trial that passed, each with its limit."""
-    missed = figures.intervals - figures.covered
-    allowed = int((1.0 - LEAST_COVERAGE) * figures.intervals + 1e-9)
+    missed, allowed = figures.intervals - figures.covered, figures.most_missed
     others = _why_not(tried)
     weak = f"; a weak element is detected in {figures.weak_found} of {figures.weak}"
     return (

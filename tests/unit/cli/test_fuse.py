@@ -136,7 +136,9 @@ def test_fused_intervals_without_a_passed_site_validation_have_one_line(
         save(tmp_path, certificate(site, passed=False))
     save(tmp_path, certificate(site))
     assert main(asked) == 0
-    assert "validation" not in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert out.count("bridge-1: Site validation of truck-1: passed; ") == 1
+    assert "No site validation" not in out
 
 
 def test_folder_of_validation_records_and_site_file_must_exist(

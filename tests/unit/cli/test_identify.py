@@ -470,7 +470,9 @@ def test_bridge_without_site_validation_has_one_line(
         save(folder, failed)
     save(tmp_path, certificate(site))
     print_validation(Console(), found, site, tmp_path)
-    assert capsys.readouterr().out == ""
+    out = capsys.readouterr().out
+    assert out.startswith("bridge-1: Site validation of truck-1: passed; ")
+    assert out.count("bridge-1:") == 1
 
 
 def test_a_certificate_that_there_is_is_named(

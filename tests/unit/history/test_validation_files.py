@@ -7,7 +7,12 @@ import pytest
 from schemas.site import Site
 from schemas.validation_records import VehicleBridgePair
 from services.common.language import language_of
-from services.history.validation_files import pairs_without_validation, save, validation_notes
+from services.history.validation_files import (
+    pairs_without_validation,
+    save,
+    validation_notes,
+    validations_passed,
+)
 from tests.builders.certificates import certificate
 from tests.unit.viewer.found import results_of, some_crossing
 
@@ -44,13 +49,28 @@ def test_record_of_the_pair_decides(site: Site, tmp_path: Path) -> None:
     (line,) = validation_notes(tmp_path, site, [PAIR])
     assert line == (
         "Site validation of truck-1 on this bridge FAILED: 12 of 12 simulated crossings were good, "
-        "49 of 60 intervals contained the truth. Do not rely on the intervals: check the site "
-        "file, try fewer elements or another truck, and validate again."
+        "49 of 60 intervals contained the truth (at least 85 % must). Do not rely on the "
+        "intervals: check the site file, try fewer elements or another truck, and validate again."
     )
     (german,) = validation_notes(tmp_path, site, [PAIR], language_of("de"))
     assert "NICHT bestanden: 12 von 12 simulierten Überfahrten" in german
     save(tmp_path, certificate(site))
     assert list(validation_notes(tmp_path, site, [PAIR])) == []
+
+
+def test_passed_record_states_the_fewest_intervals_that_pass(site: Site, tmp_path: Path) -> None:
+    figures = certificate(site).figures.model_copy(update={"intervals": 55, "covered": 48})
+    save(tmp_path, certificate(site, figures=figures.model_dump()))
+    (line,) = validations_passed(tmp_path, site, [PAIR])
+    assert line == (
+        "Site validation of truck-1: passed; 48 of 55 intervals of simulated crossings contained "
+        "the truth (at least 47 must)."
+    )
+    (german,) = validations_passed(tmp_path, site, [PAIR], language_of("de"))
+    assert "48 von 55 Intervallen" in german
+    assert "(mindestens 47 müssen es)" in german
+    other = VehicleBridgePair("truck-2", "bridge-1")
+    assert list(validations_passed(tmp_path, site, [other])) == []
 
 
 def test_record_of_another_truck_counts_for_nothing(site: Site, tmp_path: Path) -> None:

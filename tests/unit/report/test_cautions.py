@@ -313,7 +313,8 @@ def test_missing_or_failed_site_validation_is_named_once(
     save(tmp_path, failed)
     text = cautions_with(found)
     assert untried not in text
-    values = {"truck": "truck-1", "good": 1, "crossings": 1, "covered": 2, "intervals": 2}
+    figures = {"good": 1, "crossings": 1, "covered": 2, "intervals": 2, "least": 85.0}
+    values = {"truck": "truck-1"} | figures
     assert text.startswith(words.text("caution.validation_failed", **values))
     named = [one | {"certificate": failed.hash} for one in two]
     assert "driveby validate" not in cautions_with(results_of(site, *named, used="b"))
