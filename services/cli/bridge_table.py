@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from schemas.reasons import LEFT_OUT_TEXTS, BridgeReason
 from schemas.results import BridgeResult, ElementState, Parameter, Thirds, ThirdsState
+from services.common.language import ENGLISH
 from services.common.naming import count_of
 from services.identification.comparison import describe_level
 
@@ -52,8 +53,7 @@ def print_bridge(console: "Console", bridge: BridgeElements, state: BridgeResult
             soft_wrap=True,
         )
     console.print(f"measurement [bold]{state.verdict}[/]", highlight=False)
-    for code, text in zip(state.reasons, state.reason_texts, strict=True):
-        console.print(f"  {code}: {text}", highlight=False)
+    print_reasons(console, state.reasons, state.reason_texts, ENGLISH.bridge_advice)
     if not state.elements:
         return
     has_meaning = BridgeReason.NOT_FUSED not in state.reasons
@@ -64,6 +64,19 @@ def print_bridge(console: "Console", bridge: BridgeElements, state: BridgeResult
             console.print(_NO_CHANGE, highlight=False)
     for line in _of_state(state):
         console.print(line, highlight=False)
+
+
+def print_reasons(
+    console: "Console", codes: Sequence[str], texts: Sequence[str], remedies: Mapping[str, str]
+) -> None:
+    """Print each reason with its remedy, as in reports; a remedy of several reasons once."""
+    for number, (code, text) in enumerate(zip(codes, texts, strict=True)):
+        lines = [f"  {code}: {text}"]
+        remedy = remedies.get(code)
+        if remedy is not None and remedy not in map(remedies.get, codes[:number]):
+            lines.append(f"    {remedy}")
+        for line in lines:
+            console.print(line, highlight=False, markup=False)
 
 
 def print_finding(console: "Console", state: BridgeResult) -> None:

@@ -28,6 +28,7 @@ from services.cli.bridge_table import (
     print_bridge,
     print_elements,
     print_finding,
+    print_reasons,
     states_level,
 )
 from services.cli.settings import IdentifyOptions
@@ -38,6 +39,7 @@ from services.common.files import (
     replaced_atomically,
     write_atomically,
 )
+from services.common.language import ENGLISH
 from services.common.naming import count_of
 from services.common.options import validations_folder
 from services.common.progress import parts_bar, reading_bar, steps_bar
@@ -308,8 +310,7 @@ def _print_crossing(
         highlight=False,
     )
     console.print(f"verdict [bold]{crossing.verdict}[/]", highlight=False)
-    for code, text in zip(crossing.reasons, crossing.reason_texts, strict=True):
-        console.print(f"  {code}: {text}", highlight=False)
+    print_reasons(console, crossing.reasons, crossing.reason_texts, ENGLISH.advice)
     if crossing.parameters is None:
         return
     bridge = site.bridge(crossing.bridge)

@@ -25,10 +25,12 @@ from schemas.site_file import parse_site, site_hash, site_toml
 from schemas.topics import Message
 from schemas.validation_records import VehicleBridgePair, pair_hash
 from services.cli import main as cli
+from services.cli.bridge_table import print_bridge
 from services.cli.identify import _print, identify_command, print_validation
 from services.cli.settings import IdentifyOptions
 from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_lat_lon
+from services.common.language import ENGLISH
 from services.drives.importing import import_command
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.drives.settings import ImportOptions
@@ -454,6 +456,36 @@ def test_single_crossing_has_the_finding_and_its_level_once(
         assert out.lower().count("overall stiffness") == 1
         assert "not resolved: EI_1 (standard deviation above 25 %)\n" in out
         assert "thirds of the span: 0.91" in out
+
+
+def test_each_reason_is_followed_by_the_remedy_of_reports(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    reasons = ("sampler_diagnostics", "channel_inverted", "no_noise_model", "tandem")
+    crossing = some_crossing("a", verdict="suspect", reasons=reasons)
+    site = paper_site()
+    found = results_of(site, crossing | {"reason_texts": ["A.", "B [x].", "C.", "D."]})
+    _print(Console(width=200), found.model_copy(update={"bridges": {}}), site)
+    lines = capsys.readouterr().out.splitlines()
+    begin = lines.index("verdict suspect") + 1
+    assert lines[begin : begin + 7] == [
+        "  sampler_diagnostics: A.",
+        f"    {ENGLISH.advice['sampler_diagnostics']}",
+        "  channel_inverted: B [x].",
+        f"    {ENGLISH.advice['channel_inverted']}",
+        "  no_noise_model: C.",
+        "    Identify with method pre.",
+        "  tandem: D.",
+    ]
+
+
+def test_fused_state_names_the_remedy_of_its_reasons(capsys: pytest.CaptureFixture[str]) -> None:
+    site = paper_site()
+    state = results_of(site, some_crossing("a"), used="a").bridges["bridge-1"]
+    reasons = {"reasons": ("uses_suspect",), "reason_texts": ("A.",)}
+    print_bridge(Console(width=200), site.bridges[0], state.model_copy(update=reasons))
+    remedy = ENGLISH.bridge_advice["uses_suspect"]
+    assert f"  uses_suspect: A.\n    {remedy}\n" in capsys.readouterr().out
 
 
 def test_bridge_without_site_validation_has_one_line(
