@@ -23,6 +23,7 @@ from schemas.results import (
 from schemas.results_on_the_wire import estimate_to_crossing, state_to_bridge
 from schemas.signals import decode_accel, decode_gnss
 from services.bus.realm_listener import BusMessage
+from services.common.crossing_states import ON_BRIDGE, words_of_state
 from services.common.errors import one_line
 from services.common.language import utc_second
 from services.common.naming import count_of
@@ -48,19 +49,6 @@ _MAX_CROSSINGS: Final = 200
 _MAX_TRUCKS: Final = 200
 _MAX_BRIDGES: Final = 200
 _MAX_SERVICES: Final = 50
-
-_LATE_S: Final = 60.0
-"""Time in s since an entry, beyond its truck's lag, after which it is found in a recording."""
-ON_BRIDGE: Final = "on the bridge"
-FROM_RECORDING: Final = "from a recording"
-"""State of a detected crossing whose truck has left the bridge long ago."""
-_STATES: Final = {
-    pb.DETECTED: ON_BRIDGE,
-    pb.COMPLETE: "complete",
-    pb.WAITING_NOT_VALIDATED: "waits for validation",
-    pb.IDENTIFYING: "identifying",
-    pb.DONE: "done",
-}
 
 
 class TruckRow:
@@ -216,11 +204,9 @@ class RealmModel:
         return f"{vehicle} drives" if is_new else None
 
     def _take_state(self, message: pb.Crossing, now_ns: int) -> str | None:
-        state = _STATES.get(message.state, "")
         truck = self.trucks.get(message.vehicle)
-        age_s = (now_ns - message.entry_time_ns) * 1e-9 - (0.0 if truck is None else truck.lag_s)
-        if state == ON_BRIDGE and age_s > _LATE_S:
-            state = FROM_RECORDING
+        lag_ns = 0 if truck is None else round(1e9 * truck.lag_s)
+        state = words_of_state(message, now_ns - lag_ns)
         row = self.crossings.get(message.crossing_id)
         if not state or (row is not None and (row.is_over or row.state == state)):
             return None

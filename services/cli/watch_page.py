@@ -12,7 +12,6 @@ from schemas.alarms import Alarm
 from schemas.topics import is_from_recording
 from services.bus.realm_listener import other_realms_hint
 from services.cli.realm_model import (
-    ON_BRIDGE,
     SILENT_S,
     BridgeRow,
     CrossingRow,
@@ -22,6 +21,7 @@ from services.cli.realm_model import (
     route_text,
     service_figures,
 )
+from services.common.crossing_states import ON_BRIDGE
 
 _BLOCKS: Final = "▁▂▃▄▅▆▇█"
 _STEP: Final = 0.2

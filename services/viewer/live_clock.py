@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Final
+
+from schemas.proto import driveby_pb2 as pb
 
 _SOON_NS: Final = 120_000_000_000
 """Delay in ns after the exit beyond which a result is dated at the exit."""
@@ -18,8 +21,11 @@ accelerations still holds the last ones.
 class SampleClock:
     """Time of the newest sample, and the present by it."""
 
-    def __init__(self, clock: Callable[[], float]) -> None:
+    def __init__(
+        self, clock: Callable[[], float], wall_clock_ns: Callable[[], int] = time.time_ns
+    ) -> None:
         self._clock = clock
+        self._wall_clock_ns = wall_clock_ns
         self.latest_ns = 0
         """Time of the newest sample; 0: there is none."""
         self._latest_s = self._received_s = clock()
@@ -46,3 +52,15 @@ class SampleClock:
         """Return the time of a result, whose truck may be driving now."""
         now_ns = self.now_ns() if is_driving else 0
         return now_ns if exit_ns < now_ns < exit_ns + _SOON_NS else exit_ns
+
+    def present_ns(self, *, is_driving: bool) -> int:
+        """Return the present, for a truck that may send samples, which a replay dates back."""
+        return self.now_ns() if is_driving else self._wall_clock_ns()
+
+    def moment_of_state_ns(self, crossing: pb.Crossing, *, is_driving: bool) -> int:
+        """Return the time from which on a crossing has its state."""
+        if crossing.state == pb.DETECTED:
+            return crossing.entry_time_ns
+        if crossing.state == pb.COMPLETE:
+            return crossing.time_ns
+        return self.moment_ns(crossing.exit_time_ns, is_driving=is_driving)

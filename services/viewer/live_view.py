@@ -23,6 +23,7 @@ from schemas.signals import AccelBatch, GnssFix, decode_accel, decode_gnss
 from schemas.site import Site
 from services.bus.realm_listener import BusMessage
 from services.common.arrays import Floats
+from services.common.crossing_states import FROM_RECORDING, words_of_state
 from services.common.geodesy import to_chainage
 from services.identification.comparison import (
     compare,
@@ -41,7 +42,7 @@ from services.viewer.crossing_view import (
     view_of_crossing,
 )
 from services.viewer.live_clock import SampleClock
-from services.viewer.live_lanes import CrossingLanes
+from services.viewer.live_lanes import CrossingLanes, RecordedCrossings
 from services.viewer.live_layout import (
     live_blueprint,
     result_root,
@@ -87,13 +88,6 @@ _PLACES_EVERY_S: Final = 1.0
 Each move takes a kilobyte per view, at a server that keeps the history for later viewers.
 """
 
-_STATES: Final = {
-    pb.DETECTED: "on the bridge",
-    pb.COMPLETE: "complete",
-    pb.WAITING_NOT_VALIDATED: "waits for validation",
-    pb.IDENTIFYING: "identifying",
-}
-
 
 class LiveView:
     """The view of a realm in a Rerun stream; its own memory does not grow with time."""
@@ -117,6 +111,7 @@ class LiveView:
         """Drawn bridges, in order of their first appearance."""
         self._drawn: dict[str, tuple[float, str]] = {}
         """Entry time of the crossing whose result is shown, and its text, by bridge."""
+        self._recorded = RecordedCrossings()
         self._below: dict[str, str] = {}
         """Crossing whose values are shown, by bridge: a rejected one has none."""
         self._findings: dict[str, str] = {}
@@ -164,8 +159,7 @@ class LiveView:
             self._layout_is_old = False
             shown = {name: truck.channels for name, truck in self._trucks.items() if truck.channels}
             on_map = [self._site[name].on_map for name in self._bridges if name in self._site]
-            layout = live_blueprint(shown, list(self._bridges), on_map)
-            self._recording.send_blueprint(layout)
+            self._recording.send_blueprint(live_blueprint(shown, list(self._bridges), on_map))
 
     def _add_batch(self, vehicle: str, batch: AccelBatch) -> None:
         truck = self._truck(vehicle)
@@ -186,21 +180,26 @@ class LiveView:
         truck.fixes.append(fix)
 
     def _add_state(self, crossing: pb.Crossing) -> None:
-        state = _STATES.get(crossing.state)
-        if state is None:
-            return  # DONE: the estimate contains more
+        is_driving = crossing.vehicle in self._trucks
+        state = words_of_state(crossing, self._time.present_ns(is_driving=is_driving))
+        if not state or crossing.state == pb.DONE:
+            return  # of DONE the estimate contains more
         self._add_bridge(crossing.bridge)
-        moment_ns = crossing.entry_time_ns if state == "on the bridge" else crossing.time_ns
-        if state in ("identifying", "waits for validation"):
-            moment_ns = self._moment_ns(crossing.vehicle, crossing.exit_time_ns)
-        if crossing.bridge in self._bridges:
-            self._lanes.draw(crossing.bridge, crossing.vehicle, state, moment_ns)
+        if crossing.bridge not in self._bridges:
+            return
+        moment_ns = self._time.moment_of_state_ns(crossing, is_driving=is_driving)
+        self._lanes.draw(crossing.bridge, crossing.vehicle, state, moment_ns)
+        if state == FROM_RECORDING:
+            self._recorded.note(crossing)
+            self._draw_text(crossing.bridge, moment_ns)
 
     def _add_result(self, crossing: CrossingResult) -> None:
-        moment_ns = self._moment_ns(crossing.vehicle, round(crossing.exit_time * 1e9))
+        is_driving = crossing.vehicle in self._trucks
+        moment_ns = self._time.moment_ns(round(crossing.exit_time * 1e9), is_driving=is_driving)
         self._add_bridge(crossing.bridge)
         if crossing.bridge in self._bridges:
             self._lanes.draw(crossing.bridge, crossing.vehicle, crossing.verdict, moment_ns)
+        self._recorded.forget(crossing.bridge, crossing.crossing_id)
         elements = self._elements(crossing)
         drawn_s, _ = self._drawn.get(crossing.bridge, (0.0, ""))
         if crossing.entry_time < drawn_s or crossing.bridge not in self._bridges:
@@ -290,7 +289,7 @@ class LiveView:
 
     def _draw_text(self, bridge: str, moment_ns: int) -> None:
         texts = (self._drawn.get(bridge, (0.0, ""))[1], self._findings.get(bridge, ""))
-        text = bridge_text(self._alarms.get(bridge), *texts)
+        text = bridge_text(self._alarms.get(bridge), self._recorded.text(bridge), *texts)
         document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
         TimestampedStream(self._recording, moment_ns).log(f"newest/{bridge}", document)
 
@@ -340,7 +339,3 @@ class LiveView:
         if elements is not None and crossing.bridge in self._bridges:
             self._elements_of_results[crossing.bridge] = elements
         return elements
-
-    def _moment_ns(self, vehicle: str, exit_ns: int) -> int:
-        """Return the time of a result on the clock of the samples."""
-        return self._time.moment_ns(exit_ns, is_driving=vehicle in self._trucks)

@@ -234,6 +234,37 @@ def test_what_is_heard_late_is_where_it_belongs(live: Live, site: Site) -> None:
     assert times_s(lane) == pytest.approx([0.0, 4.0, 4.001], abs=1e-6)
 
 
+def a_day_later(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_ns = START_NS + 86_400_000_000_000
+    monkeypatch.setattr(live.picture._time, "_wall_clock_ns", lambda: now_ns)
+
+
+def test_crossing_of_a_recording_is_not_on_the_bridge_now(
+    live: Live, site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    a_day_later(live, monkeypatch)
+    live.hears("bridge", "crossing", state(pb.DETECTED))
+    live.hears("bridge", "crossing", state(pb.IDENTIFYING))
+    live.hears("bridge", "estimate", estimate(result(site)))
+    chunks = live.drawn()
+    lane = values(rows(chunks, "crossings/bridge-1/truck-1"), "StateChange:state")
+    assert lane == ["from a recording", "identifying", "good"]
+    texts = values(rows(chunks, "newest/bridge-1"), "TextDocument:text")
+    line = "From a recording: truck-1 crossed on 2026-09-21 14:13:20 UTC. No result yet."
+    assert line in texts
+    assert line not in texts[-1]
+
+
+def test_driving_truck_of_a_replay_is_on_the_bridge(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    a_day_later(live, monkeypatch)
+    drives(live, 2)
+    live.hears("bridge", "crossing", state(pb.DETECTED))
+    lane = values(rows(live.drawn(), "crossings/bridge-1/truck-1"), "StateChange:state")
+    assert lane == ["on the bridge"]
+
+
 def test_a_result_is_drawn_and_the_next_takes_its_place(live: Live, site: Site) -> None:
     live.hears("bridge", "estimate", estimate(result(site)))
     weak_before = "latest/bridge-1/strip/weak"
