@@ -76,6 +76,7 @@ def run(asked: WorkerSettings, ready: Callable[[], None] | None = None) -> int:
     _check(asked)
     search = _search(asked)
     with _locked_folder(asked):
+        _log.info("starting: loading kernels")
         return _run(asked, search, ready)
 
 

@@ -308,6 +308,7 @@ def test_a_signal_ends_a_worker_that_waits_for_a_router(
 ) -> None:
     process = worker()
     assert process.stderr is not None
+    assert "starting: loading kernels" in process.stderr.readline()
     assert any("no router answers" in line for line in process.stderr)  # and it tries on
     os.kill(process.pid, signal.SIGTERM)
     _, log = process.communicate(timeout=LONGEST_S)
