@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from schemas.results import CrossingResult
 from services.common.language import Language, utc_day
-from services.report.bridge import BridgeReport
+from services.report.bridge import BridgeReport, still_weak
 from services.report.cautions import named_elements, possibly_weak, weak_before
 from services.report.place import position_of
 
@@ -23,7 +23,12 @@ def next_steps(report: BridgeReport, language: Language) -> Iterator[str]:
             yield from _implausible(report, language)
             yield from _stiffer(report, language)
             yield from _drive_again(report, language)
-        case "sound" | "known":
+        case "known":
+            still = _still_weak(report)
+            yield language.choice("advice.known", len(still), elements=language.listed(still))
+            yield from _possibly(report, language)
+            yield from _earlier(report, language, still)
+        case "sound":
             yield language.text("advice.sound")
             yield from _possibly(report, language)
             yield from _earlier(report, language)
@@ -95,12 +100,17 @@ def _possibly(report: BridgeReport, language: Language) -> Iterator[str]:
         yield language.choice("advice.lower", len(numbers), elements=language.listed(numbers))
 
 
-def _earlier(report: BridgeReport, language: Language) -> Iterator[str]:
-    """Yield that an element which was weak in the baseline is still to be inspected."""
+def _still_weak(report: BridgeReport) -> list[str]:
+    """Return the numbers of the elements that are as weak as in the baseline."""
+    return still_weak(report.view, None if report.before is None else report.before.estimate)
+
+
+def _earlier(report: BridgeReport, language: Language, named: Sequence[str] = ()) -> Iterator[str]:
+    """Yield that elements which were weak in the baseline, except `named`, are to be inspected."""
     now = () if report.view.comparison is None else report.view.comparison.weak
-    known = {one.number for one in now}
-    weak = [one.number for one in weak_before(report.view, report.before)]
-    numbers = [str(number) for number in weak if number not in known]
+    known = {*named, *(str(one.number) for one in now)}
+    weak = [str(one.number) for one in weak_before(report.view, report.before)]
+    numbers = [number for number in weak if number not in known]
     if numbers:
         yield language.choice("advice.earlier", len(numbers), elements=language.listed(numbers))
 

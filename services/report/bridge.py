@@ -282,7 +282,7 @@ def _finding(
         key = "finding.appears" if but else "finding.weak"
         return BridgeFinding("weak", language.choice(key, len(weak)) + but, wording)
     missed = _why_open(view, view.comparison, language)
-    known = _still_weak(view, baseline)
+    known = still_weak(view, baseline)
     if known:
         headline = language.choice("finding.known", len(known), elements=language.listed(known))
         seen = () if missed is None else (_seen(view.comparison, language),)
@@ -299,7 +299,7 @@ def _finding(
     return BridgeFinding("open", missed + but, sentences)
 
 
-def _still_weak(view: BridgeView, baseline: Estimate | None) -> list[str]:
+def still_weak(view: BridgeView, baseline: Estimate | None) -> list[str]:
     """Return the numbers of the elements that are as weak as in the baseline."""
     if baseline is None or view.estimate is None:
         return []

@@ -146,20 +146,30 @@ def test_element_weak_in_the_baseline_is_named(site: Site, then: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("language", "words"),
+    ("language", "words", "step"),
     [
-        ("en", "No clear change; element 4 is still less stiff than the others."),
-        ("de", "Keine deutliche Änderung; Element 4 ist weiterhin weniger steif als die anderen."),
+        (
+            "en",
+            "No clear change; element 4 is still less stiff than the others.",
+            "Element 4 was weak before and shows no clear change. Carry out the inspections that",
+        ),
+        (
+            "de",
+            "Keine deutliche Änderung; Element 4 ist weiterhin weniger steif als die anderen.",
+            "Element 4 war schon vorher schwach und zeigt keine deutliche Änderung. Führen Sie",
+        ),
     ],
 )
-def test_weak_element_that_has_not_changed_is_the_headline(
-    site: Site, then: Path, language: str, words: str
+def test_weak_element_that_has_not_changed_leads_headline_and_advice(
+    site: Site, then: Path, language: str, words: str, step: str
 ) -> None:
     files = [(Path("now.json"), changed(site, 1.0), site)]
     (report,) = bridge_reports(files, then, language=language_of(language))
     assert report.finding.kind == "known"
     assert report.finding.headline.startswith(words)
-    assert list(next_steps(report, language_of(language)))
+    first, *others = next_steps(report, language_of(language))
+    assert first.startswith(step)
+    assert not any("4" in other for other in others)
 
 
 @pytest.mark.parametrize(
