@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from services.common.arrays import Floats
 from services.common.language import ENGLISH, Language
-from services.viewer.bridge_view import BridgeView, describe_bridge, origin_of
+from services.viewer.bridge_view import BridgeView, summary_of_bridge
 from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView
 from services.viewer.drawing import (
     BANNERS,
@@ -239,13 +239,15 @@ def _draw_heading(figure: Figure, bridge: BridgeView, lines: list[str]) -> None:
 def _heading(bridge: BridgeView) -> list[str]:
     """Return the lines of text above the figure."""
     doubt = f"DOUBTFUL: {_doubt(bridge)} " if bridge.is_doubtful else ""
-    sentences = " ".join((*describe_bridge(bridge), origin_of(bridge))).strip()
+    sentences = summary_of_bridge(bridge)
     if bridge.estimate is None:
         number = len(bridge.crossings)
         sentences = f"No finding: none of {number} crossings could be used."
         if number == 1:
             sentences = "No finding: the only crossing could not be used."
-    return textwrap.wrap(doubt + sentences, 112, max_lines=6, placeholder=" …")
+    unbroken = (doubt + sentences).replace(" %", "\u00a0%")
+    lines = textwrap.wrap(unbroken, 112, max_lines=6, placeholder=" …")
+    return [line.replace("\u00a0", " ") for line in lines]
 
 
 def _doubt(bridge: BridgeView) -> str:

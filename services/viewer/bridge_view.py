@@ -108,6 +108,15 @@ def origin_of(view: BridgeView) -> str:
     return origin_of_state(view.state)
 
 
+def summary_of_bridge(view: BridgeView) -> str:
+    """Return the sentences of a figure: the result, elements weak in the baseline, the origin."""
+    before: tuple[comparison.Element, ...] = ()
+    if view.baseline is not None and view.comparison is not None:
+        before = comparison.weak_before(view.baseline, view.nominal_nm2, view.edges_m)
+    weak = comparison.describe_weak_before(before)
+    return " ".join((*describe_bridge(view), *weak, origin_of(view))).strip()
+
+
 def view_of_bridge(bridge: Bridge, results: Results, baseline: Estimate | None) -> BridgeView:
     """Return the view of one bridge in results; `baseline` is its stored state."""
     crossings = sorted(

@@ -23,7 +23,7 @@ from services.common.files import replaced_atomically
 from services.common.parquet_files import arrow
 from services.common.progress import Steps, no_step_progress
 from services.viewer.bridge_figure import draw_bridge
-from services.viewer.bridge_view import BridgeView, describe_bridge, origin_of
+from services.viewer.bridge_view import BridgeView, summary_of_bridge
 from services.viewer.crossing_scene import scenes_of
 from services.viewer.crossing_tab import log_crossing, when_and_where
 from services.viewer.crossing_view import (
@@ -198,7 +198,7 @@ def _log_overview(recording: rr.RecordingStream, bridge: BridgeView) -> None:
     _log_picture(recording, f"{root}/picture", figure)
     wording = "None of the crossings could be used."
     if bridge.estimate is not None:
-        wording = " ".join((*describe_bridge(bridge), origin_of(bridge))).strip()
+        wording = summary_of_bridge(bridge)
     doubt = "**Doubtful. Do not rely on these values.** " if bridge.is_doubtful else ""
     lines = [f"# {bridge.owner_id or bridge.bridge}", "", f"{doubt}{wording}", ""]
     verdicts = [crossing.verdict for crossing in bridge.crossings]

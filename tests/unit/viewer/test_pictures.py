@@ -17,7 +17,7 @@ from schemas.results import CrossingResult, Results, results_json
 from schemas.site import Site
 from services.cli import main as cli
 from services.common.language import ENGLISH, language_of
-from services.viewer.bridge_figure import draw_bridge
+from services.viewer.bridge_figure import _heading, draw_bridge
 from services.viewer.bridge_view import BridgeView, view_of_bridge
 from services.viewer.crossing_view import comparison_of, view_of_crossing
 from services.viewer.crossings_figure import draw_crossings
@@ -220,6 +220,18 @@ def test_identify_draws_the_baseline_that_it_compares_with(
     svg = (folder / "bridge-1.svg").read_text()
     assert "<!-- baseline -->" in svg
     assert "<!-- Flexural rigidity EI (numbers: change from the baseline) -->" in svg
+
+
+def test_picture_names_an_element_that_was_weak_in_its_baseline(site: Site) -> None:
+    results = results_of(site, some_crossing("a"), used="a")
+    alone = view_of_bridge(site.bridges[0], results, None)
+    words = "Element 4 (60 %, 95 % interval"
+    assert not any(words in line for line in _heading(alone))
+    lines = _heading(view_of_bridge(site.bridges[0], results, alone.estimate))
+    text = " ".join(lines)
+    assert words in text
+    assert "was clearly less stiff than the others in the baseline already" in text
+    assert not any(line.startswith("%") for line in lines)
 
 
 def test_results_of_a_bridge_without_its_state_are_drawn(site: Site) -> None:
