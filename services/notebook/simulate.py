@@ -32,8 +32,10 @@ from services.simulation.drive import (
     SimulatedDrive,
     declared_site,
     given_road,
+    noise_density_of,
     paper_site,
     ratios_of,
+    road_class_of,
     simulate_drive,
     write_drive,
 )
@@ -114,7 +116,7 @@ def simulate(
     scenario: int | None = None,
     ei: Sequence[float] | NDArray[Any] | None = None,
     site: Name | Site | None = None,
-    road: str | tuple[ArrayLike, ArrayLike] = "A",
+    road: str | tuple[ArrayLike, ArrayLike] | None = None,
     seed: int = 1,
     noise: float | None = None,
     speed: float | Sequence[float] | NDArray[Any] = 10.0,
@@ -126,11 +128,11 @@ def simulate(
 
     The options are those of `driveby simulate`. The truth is a damage `scenario` of the paper (1 to
     12) or `ei` (n,), the ratio of each element's EI to its nominal value. `site` is by default that
-    of the paper. `road` is an ISO 8608 class, A to E, or a profile under both axles: chainages from
-    the start of the bridge and heights (n,) in m, level beyond its ends. `noise` is the
-    accelerometers' noise density in µg/√Hz, by default that of a given site, else 0; method pre
-    needs some. `speed` is in m/s, or a pair (start, end); `rate` in Hz is by default the site's.
-    BLAS is limited to one thread meanwhile.
+    of the paper. `road` is an ISO 8608 class, A to E (by default the site's, or A), or a profile
+    under both axles: chainages from the start of the bridge and heights (n,) in m, level beyond its
+    ends. `noise` is the accelerometers' noise density in µg/√Hz, by default that of a given site,
+    else 0; method pre needs some. `speed` is in m/s, or a pair (start, end); `rate` in Hz is by
+    default the site's. BLAS is limited to one thread meanwhile.
 
     All drives begin at one time; crossings to be fused need others: `Simulation.started_at`.
 
@@ -145,13 +147,14 @@ def simulate(
     ratios = None if ei is None else numbers("ei", ei, 1e-3, 1e3, _RATIOS)
     speeds = one_or_two("speed", speed, 0.1, 60, "(start, end)")
     known = paper_site() if site is None else middle_site(given_site(site))
-    declared = 0.0 if site is None else known.sensor.noise_density_ug_per_rthz
-    density = declared if noise is None else number("noise", noise, 0, 1e6)
+    asked = None if noise is None else number("noise", noise, 0, 1e6)
+    density = noise_density_of(None if site is None else known, asked)
+    of_road = road_class_of(known, None) if road is None else given_road(road)
     with one_blas_thread():
         drive = simulate_drive(
             known,
             ratios_of(known.bridges[0], number_of, ratios, prefix=""),
-            DrivenRoad(given_road(road), whole("seed", seed, 0, (1 << 63) - 1)),
+            DrivenRoad(of_road, whole("seed", seed, 0, (1 << 63) - 1)),
             Measurement(
                 density,
                 rate_hz=None if rate is None else number("rate", rate, 50, 50_000),

@@ -9,10 +9,10 @@ from services.finding.placed import middle_site
 from services.planning.alternatives import with_noise, with_tyres
 from services.planning.crossings import PlannedRoad
 from services.planning.survey import SurveyForecast, SurveyQuestion, forecast_survey
+from services.simulation.drive import road_class_of
 
 _SPEEDS: Final = (5.0, 20.0)
 _USUAL_M_PER_S: Final = 10.0
-_ROAD_CLASS: Final = "A"
 
 
 class SurveyWishes(NamedTuple):
@@ -49,5 +49,5 @@ def plan_survey(given: Site, wishes: SurveyWishes, report: Steps) -> SurveyForec
     question = SurveyQuestion(
         wishes.loss, wishes.crossings, min(max(wanted, speeds[0]), speeds[1]), speeds
     )
-    road_class = wishes.road_class or site.bridges[0].road_class or _ROAD_CLASS
-    return forecast_survey(site, PlannedRoad(road_class, wishes.wander_m), question, report)
+    road = PlannedRoad(road_class_of(site, wishes.road_class), wishes.wander_m)
+    return forecast_survey(site, road, question, report)

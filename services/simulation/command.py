@@ -19,8 +19,11 @@ from services.simulation.drive import (
     Measurement,
     OutOfModelEffects,
     declared_site,
+    densities_of,
+    noise_density_of,
     paper_site,
     ratios_of,
+    road_class_of,
     simulate_drive,
     write_drives,
 )
@@ -67,8 +70,7 @@ def _simulate_plane(
     console: "Console",
 ) -> int:
     ratios = ratios_of(known.bridges[0], asked.scenario, asked.ei)
-    declared = 0.0 if asked.site is None else known.sensor.noise_density_ug_per_rthz
-    noise = declared if asked.noise is None else asked.noise
+    noise = noise_density_of(None if asked.site is None else known, asked.noise)
     twist = twist_of(known.bridges[0], asked.lane_offset, asked.torsion)
     effects = effects_of(asked)._replace(twist=twist)
     paths = None if surface is None else wheel_paths_of(known.vehicles[0], surface)
@@ -80,7 +82,7 @@ def _simulate_plane(
             drive = simulate_drive(
                 known,
                 ratios,
-                DrivenRoad(asked.road, asked.seed, paths),
+                DrivenRoad(road_class_of(known, asked.road), asked.seed, paths),
                 Measurement(
                     noise,
                     rate_hz=asked.rate,
@@ -140,9 +142,8 @@ def _with_tandem(asked: SimulateOptions, site: Site) -> Site | None:
         return site
     if asked.axles != 3:
         return None
-    declared = 0.0 if asked.site is None else max(site.sensor.noise_density_ug_per_rthz)
-    noise = declared if asked.noise is None else asked.noise
-    tipper = usual_tandem(noise, asked.tyres or "twin")
+    noise = noise_density_of(None if asked.site is None else site, asked.noise)
+    tipper = usual_tandem(max(densities_of(noise)), asked.tyres or "twin")
     rate = max(site.sensor.rate_hz)
     sensors = tuple(one.model_copy(update={"rate_hz": rate}) for one in tipper.sensors)
     tipper = tipper.model_copy(update={"sensors": sensors})
@@ -159,7 +160,7 @@ def _simulate_tandem(asked: SimulateOptions, site: Site, console: "Console") -> 
     check_writable(asked.output, force=asked.force)
     lane_m, torsion = driven_lane(site.bridges[0], asked.lane_offset, asked.torsion)
     how = TandemDrive(
-        (asked.road, asked.seed),
+        (road_class_of(site, asked.road), asked.seed),
         asked.noise,
         begin,
         asked.direction == "start_to_end",

@@ -154,6 +154,18 @@ def densities_of(noise_ug_per_rthz: float | Densities) -> Densities:
     return noise_ug_per_rthz
 
 
+def noise_density_of(site: Site | None, asked_ug_per_rthz: float | None) -> float | Densities:
+    """Return the noise density in µg/√Hz that is asked for, else that of a given site, else 0."""
+    if asked_ug_per_rthz is not None:
+        return asked_ug_per_rthz
+    return 0.0 if site is None else site.sensor.noise_density_ug_per_rthz
+
+
+def road_class_of(site: Site, asked: str | None) -> str:
+    """Return the ISO 8608 class that is asked for, else that of the site's first bridge, else A."""
+    return asked or site.bridges[0].road_class or "A"
+
+
 def declared_site(site: Site, noise_ug_per_rthz: float | Densities, rate_hz: float) -> Site:
     """Return the site as the owner of this simulated truck would declare it, with sensor noise."""
     sensor = site.sensor.model_copy(

@@ -67,7 +67,9 @@ class SimulateOptions:
         int,
         choices=(2, 3),
     )
-    road: str = opt("road class by ISO 8608 (default: A)", default="A", choices=tuple("ABCDE"))
+    road: str | None = opt(
+        "road class by ISO 8608 (default: the site's road_class, or A)", choices=tuple("ABCDE")
+    )
     seed: int = seed_option()
     noise: float | None = noise_option(
         "accelerometers' noise density in µg/√Hz (default: the site's, or 0)", default=None

@@ -1,11 +1,11 @@
-"""Noise of simulated accelerometers: by `--noise`, else that which a given site declares."""
+"""Noise and road of a simulated drive: by option, else those that a given site declares."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from driveby import simulate
+from driveby import read, simulate
 from pre_core.constants import MICRO_G_M_PER_S2
 from schemas.signals import CHANNELS
 from schemas.site_file import site_toml
@@ -40,6 +40,38 @@ def test_recording_declares_the_simulated_noise(
     given = ["simulate", "--site", str(file), "--scenario", "6", "--speed", "20", *options]
     assert main([*given, "-o", str(out)]) == 0
     assert site_of([out], None).sensor.noise_density_ug_per_rthz == declared
+
+
+def test_road_has_the_class_of_the_site() -> None:
+    site = paper_site()
+    bridge = site.bridges[0].model_copy(update={"road_class": "C"})
+    rough = site.model_copy(update={"bridges": (bridge,)})
+    of_site, of_option, best = (
+        simulate(scenario=6, speed=20.0, site=one, road=road).road_m[1]
+        for one, road in ((rough, None), (rough, "B"), (site, None))
+    )
+    # Each class has twice the amplitude of the one before.
+    np.testing.assert_allclose(of_site, 4.0 * best)
+    np.testing.assert_allclose(of_option, 2.0 * best)
+
+
+@pytest.mark.parametrize("axles", [["--seed", "2"], ["--axles", "3"]])
+def test_command_takes_the_road_of_the_site(axles: list[str], tmp_path: Path) -> None:
+    site = paper_site()
+    written = []
+    for name, road_class, options in (
+        ("site", "C", []),
+        ("option", None, ["--road", "C"]),
+        ("best", None, []),
+    ):
+        bridge = site.bridges[0].model_copy(update={"road_class": road_class})
+        file, out = tmp_path / f"{name}.toml", tmp_path / f"{name}.mcap"
+        file.write_text(site_toml(site.model_copy(update={"bridges": (bridge,)})))
+        given = ["simulate", "--site", str(file), "--scenario", "6", "--speed", "20", *axles]
+        assert main([*given, *options, "-o", str(out)]) == 0
+        (run,) = read(out)
+        written.append(np.std(run.channels["sprung_front"].acceleration_m_per_s2))
+    assert written[0] == written[1] > 1.5 * written[2]
 
 
 def test_truth_of_other_elements_names_the_option(
