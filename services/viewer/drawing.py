@@ -108,6 +108,17 @@ def figure_bytes(figure: Figure, form: str, *, dpi: int = DPI) -> bytes:
     return buffer.getvalue()
 
 
+def _beside_verdict(sentences: Sequence[str]) -> str:
+    """Return the first sentence with the number of the others, which may cost no part of it."""
+    others = len(sentences) - 1
+    if not others:
+        return shortened(sentences[0], _BESIDE_VERDICT)
+    for more in (f" (and {count_of(others, 'more sentence')})", f" (and {others} more)"):
+        if len(sentences[0]) + len(more) <= _BESIDE_VERDICT:
+            break
+    return shortened(sentences[0], _BESIDE_VERDICT - len(more)) + more
+
+
 def draw_verdict(
     figure: Figure,
     verdict: str,
@@ -124,12 +135,8 @@ def draw_verdict(
         colour = VERDICT_COLOURS["good"]
         figure.text(LEFT, top, "verdict: good", color=colour, fontweight="bold", **words)
         if sentences:
-            others = count_of(len(sentences) - 1, "more sentence")
-            more = f" (and {others})" if len(sentences) > 1 else ""
-            short = shortened(sentences[0], _BESIDE_VERDICT - len(more)) + more
-            figure.text(
-                LEFT + 0.12, top, short, color=INK, fontsize=8.3, va="top", parse_math=False
-            )
+            short: dict[str, Any] = {"fontsize": 8.3, "va": "top", "parse_math": False}
+            figure.text(LEFT + 0.12, top, _beside_verdict(sentences), color=INK, **short)
         return
     height = 0.40 / figure.get_figheight()
     figure.add_artist(
