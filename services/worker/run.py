@@ -76,7 +76,6 @@ def run(asked: WorkerSettings, ready: Callable[[], None] | None = None) -> int:
     _check(asked)
     search = _search(asked)
     with _locked_folder(asked):
-        _log.info("starting: loading kernels")
         return _run(asked, search, ready)
 
 
@@ -94,6 +93,7 @@ def _run(asked: WorkerSettings, search: Search, ready: Callable[[], None] | None
         def report(crossing_id: str, stage: str, fraction: float) -> None:
             publish_progress(publisher, asked.service_id, crossing_id, stage, fraction)
 
+        _log.info("starting: loading kernels")
         limits = TaskLimits(processor_s=asked.limit_s)
         execution = stack.enter_context(
             ProcessExecutor(asked.processes, report=report, limits=limits)
