@@ -33,6 +33,8 @@ _NOW_S = 1_800_000_000
 _CLOCK = Path(__file__).with_name("clock")
 _LONGEST_S = 3600.0
 """Longest wall time of one command (s): a busy machine compiles the kernels in many minutes."""
+_PROGRESS = "INFO driveby.progress: "
+"""Mark of lines of progress, whose number depends on the machine's speed."""
 
 
 class Run(NamedTuple):
@@ -77,7 +79,10 @@ class Run(NamedTuple):
         two trees which both fail are not the same.
         """
         done = self.python("-m", "driveby", *words)
-        text = f"exit code {done.returncode}\n{done.stdout}--- standard error\n{done.stderr}"
+        errors = "".join(
+            line for line in done.stderr.splitlines(keepends=True) if _PROGRESS not in line
+        )
+        text = f"exit code {done.returncode}\n{done.stdout}--- standard error\n{errors}"
         (self.folder / f"{name}.out").write_text(text)
         assert code in (None, done.returncode), f"{' '.join(words)}: {text}"
         return done.stdout
