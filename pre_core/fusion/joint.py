@@ -40,10 +40,10 @@ from pre_core.fusion.path_groups import (
 from pre_core.fusion.variability import (
     VariabilityPosterior,
     draws_of_tau,
+    draws_of_tau_within,
     is_consistent_with_zero,
     marginalise_variability,
     mean_variability,
-    tau_draws,
     variability_posterior,
     varying_bridge,
 )
@@ -298,7 +298,7 @@ def _draw_bridge(
             information, priors, *marginalise_variability(information, of, tau, rho)[:2]
         )
         steps.append(_Step(density, some, (int(k) + 1) * CHAINS))
-        taus.append(tau_draws(between, int(k), (some, CHAINS), rng))
+        taus.append(draws_of_tau_within(between, int(k), (some, CHAINS), rng))
     of_chains: list[FloatArray] = []
     with ThreadPoolExecutor(threads) as pool:
         for one in pool.map(partial(_chain, steps, seed), range(CHAINS)):

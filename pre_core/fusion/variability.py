@@ -170,7 +170,7 @@ def mean_variability(between: VariabilityPosterior) -> tuple[float, float]:
 
 
 def draws_of_tau(between: VariabilityPosterior, count: int, rng: np.random.Generator) -> FloatArray:
-    """Return draws (count,) of tau."""
+    """Return draws (count,) of tau, over all cells."""
     fine = between.fine[_cells(between)]
     return np.asarray(rng.choice(fine.ravel(), count, p=between.within.ravel()))
 
@@ -179,7 +179,7 @@ def _cells(between: VariabilityPosterior) -> NDArray[np.int64]:
     return np.arange(between.tau.size) // len(_RHOS)
 
 
-def tau_draws(
+def draws_of_tau_within(
     between: VariabilityPosterior, k: int, shape: tuple[int, int], rng: np.random.Generator
 ) -> FloatArray:
     """Return draws of tau (…) in cell k, of the given shape."""

@@ -1,21 +1,19 @@
 """Printed tables of a bridge and its elements."""
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import date
 from typing import TYPE_CHECKING, Protocol
 
 from schemas.reasons import LEFT_OUT_TEXTS, BridgeReason
 from schemas.results import BridgeResult, ElementState, Parameter, Thirds, ThirdsState
 from services.common.language import ENGLISH
-from services.common.naming import count_of
+from services.common.naming import count_of, entry_in_name
 from services.identification.comparison import describe_level
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 
-_ENTRY = re.compile(r"\.(\d{8})T[\d.]+Z$")
-"""Entry time at the end of a crossing's name, with its day."""
 _NO_CHANGE = (
     "all crossings are combined here; whether EI changed between them: driveby history, driveby "
     "alarm check"
@@ -84,9 +82,10 @@ def print_finding(console: "Console", state: BridgeResult) -> None:
     console.print(f"[bold]the bridge:[/] {state.finding}", highlight=False)
 
 
-def _days(state: BridgeResult) -> set[str]:
+def _days(state: BridgeResult) -> set[date]:
     """Return the days of a state's crossings, as in their names."""
-    return {found[1] for name in state.crossings_used if (found := _ENTRY.search(name))}
+    entries = map(entry_in_name, state.crossings_used)
+    return {entry.date() for entry in entries if entry is not None}
 
 
 def level_lines(

@@ -3,9 +3,7 @@
 No bus, no terminal, no clock: the time is given with each message.
 """
 
-import re
 from collections import deque
-from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -26,7 +24,7 @@ from services.bus.realm_listener import BusMessage
 from services.common.crossing_states import ON_BRIDGE, words_of_state
 from services.common.errors import one_line
 from services.common.language import utc_second
-from services.common.naming import count_of
+from services.common.naming import count_of, entry_in_name
 from services.identification.comparison import Comparison, compare, estimate_of_state
 from services.viewer.crossing_view import (
     ResultElements,
@@ -35,8 +33,6 @@ from services.viewer.crossing_view import (
     view_of_crossing,
 )
 
-_ENTRY: Final = re.compile(r"\.(\d{8}T\d{6}\.\d{3})Z$")
-"""Entry time at the end of a crossing's name."""
 _RATE_S: Final = 5.0
 """Duration in s over which rates are computed."""
 _LAGS: Final = 100
@@ -308,10 +304,9 @@ class RealmModel:
 
 def _entry_ns(crossing: CrossingResult) -> int:
     """Return the entry in the crossing's name, as its states have it; else the estimated one."""
-    found = _ENTRY.search(crossing.crossing_id)
-    if found is None:
+    entry = entry_in_name(crossing.crossing_id)
+    if entry is None:
         return round(crossing.entry_time * 1e9)
-    entry = datetime.strptime(found[1], "%Y%m%dT%H%M%S.%f").replace(tzinfo=UTC)
     return round(entry.timestamp() * 1e3) * 1_000_000
 
 

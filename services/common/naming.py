@@ -1,9 +1,26 @@
-"""Names that users and files give, as identifiers of keys, and counted nouns."""
+"""Names that users and files give, as identifiers of keys; of crossings; and counted nouns."""
 
 import re
+from datetime import UTC, datetime
+from typing import Final
 
 from schemas.topics import check_identifier
 from services.common.errors import InputError
+
+_MOMENT: Final = "%Y%m%dT%H%M%S.%f"
+_ENTRY: Final = re.compile(r"\.(\d{8}T\d{6}\.\d{3})Z$")
+
+
+def name_of_crossing(vehicle: str, bridge: str, entry_s: float) -> str:
+    """Return the name of a crossing that begins `entry_s` seconds after 1970 UTC."""
+    moment = datetime.fromtimestamp(entry_s, UTC).strftime(_MOMENT)[:-3]
+    return f"{vehicle}.{bridge}.{moment}Z"
+
+
+def entry_in_name(crossing_id: str) -> datetime | None:
+    """Return the entry in the name of a crossing in UTC, in whole ms; None without one."""
+    found = _ENTRY.search(crossing_id)
+    return None if found is None else datetime.strptime(f"{found[1]}+0000", f"{_MOMENT}%z")
 
 
 def identifier_from(text: str) -> str:

@@ -7,7 +7,6 @@ clock, so that the same messages give the same crossings, live or from a recordi
 
 import contextlib
 from collections.abc import Callable, Collection, Iterable, Iterator
-from datetime import UTC, datetime
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from schemas.signals import TRUCK_DECODERS, AccelBatch, GnssFix, VehicleInfo, decode_gnss
 from schemas.site import Bridge, Site, Vehicle
 from schemas.topics import Key
+from services.common.naming import name_of_crossing
 from services.finding.crossing_data import (
     LONGEST_MARGIN_S,
     Complete,
@@ -273,8 +273,7 @@ class Finder:
     def _named(self, truck: TruckBoot, bridge: Bridge, stay: Stay) -> str:
         """Return the name of a stay that this finder detects for the first time."""
         wall_ns = truck.boot.wall_time_ns(stay.entry_s)
-        moment = datetime.fromtimestamp(wall_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3]
-        own = f"{truck.vehicle.id}.{bridge.id}.{moment}Z"
+        own = name_of_crossing(truck.vehicle.id, bridge.id, wall_ns / 1e9)
         known = self._recognise(_detection(truck, bridge, stay, own))
         name = known or Name(own, is_decided=False)
         truck.detected[bridge.id, stay.entry_s] = name.crossing_id
