@@ -34,6 +34,12 @@ _LARGE_OFFSET_M = 0.02
 centimetres. Without it an offset of a hand's width would pass for twin tyres."""
 _WORN = 0.9
 _GRID_CYCLES_PER_M = 0.02
+TRACK_SHAPES = 2
+"""Number of spectra that belong to the axles' tracks: of unequal tyres, and of an offset."""
+_ROLL_STEP = 0.125
+_ROLL_BANDS = np.exp(_ROLL_STEP * np.arange(0, 7))
+"""Middles of the bands of the axles' roll relative to the frequency of an axle on its tyres. The
+roll inertia of an axle is 0.3 to 0.9 of its mass times half the track squared."""
 _MAX_CYCLES_PER_M = 24.0
 LONG_CYCLES_PER_M = 0.05
 """Spatial frequency relevant for bridges, at which a mismatch is reported."""
@@ -139,6 +145,26 @@ def between_run_spectra(front: Footprint, rear: Footprint, wander_m: float) -> F
             )
             for one, other in _pairs(front, rear)
         ]
+    )
+
+
+def with_axle_roll(shapes: MismatchSpectra, hop_hz: float, speed_m_per_s: float) -> MismatchSpectra:
+    """Return the spectra with one more for each band in which the axles may roll at a speed.
+
+    A sensor beside the middle of its axle reads a part of the roll, by which an offset's spectrum
+    rises at the axle's roll resonance, `_ROLL_BANDS` relative to the frequency `hop_hz` of its mass
+    on its tyres. A band is a hat over the logarithm of the frequency.
+    """
+    n = shapes.cycles_per_m
+    at = np.log(np.maximum(n, n[1]) * speed_m_per_s / hop_hz)
+    hats = np.maximum(0.0, 1.0 - np.abs(at - np.log(_ROLL_BANDS)[:, None]) / _ROLL_STEP)
+    front = hats * shapes.front_cross_spectrum_density[1]
+    rear = hats * shapes.rear_cross_spectrum_density[1]
+    return shapes._replace(
+        density=np.vstack([shapes.density, [_windowed(one) for one in front - rear]]),
+        front_cross_spectrum_density=np.vstack([shapes.front_cross_spectrum_density, front]),
+        rear_cross_spectrum_density=np.vstack([shapes.rear_cross_spectrum_density, rear]),
+        expected_m=np.append(shapes.expected_m, np.zeros(len(hats))),
     )
 
 

@@ -308,7 +308,7 @@ def mismatch_levels(
     metres = rows.every * rows.step_s * road.speed_m_per_s
     surface = _mismatch.surface_level(shapes, whole, [metres * one.size for one in roads])
     expected = surface * shapes.expected_m
-    usual = np.array([np.inf, expected[1]])
+    usual = np.append([np.inf, expected[1]], np.full(expected.size - 2, np.inf))
     parts = [_mismatch.tapered_periodogram(one, of_sensors, of_shapes[:-1]) for one in stretches]
     if not has_only_offset:
         level, statistic = _mismatch.estimate_levels(parts, usual)

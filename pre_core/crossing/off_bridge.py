@@ -3,7 +3,7 @@
 import numpy as np
 
 from pre_core.arrays import FloatArray
-from pre_core.crossing.mismatch import has_equal_tyres
+from pre_core.crossing.mismatch import TRACK_SHAPES, has_equal_tyres
 from pre_core.crossing.noise import mismatch_levels
 from pre_core.crossing.posterior import (
     PosteriorProblem,
@@ -40,7 +40,7 @@ def mismatch_excess(problem: PosteriorProblem, y: FloatArray) -> float:
     an estimate.
     """
     level, _, expected = _levels_off_bridge(problem, y)
-    return float(level.sum() / expected.sum()) if expected.sum() > 0.0 else 0.0
+    return float(level[:TRACK_SHAPES].sum() / expected.sum()) if expected.sum() > 0.0 else 0.0
 
 
 def surface_level_at(problem: PosteriorProblem, y: FloatArray) -> float:

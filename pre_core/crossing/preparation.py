@@ -17,7 +17,7 @@ from pre_core.crossing.front_axle import (
     with_lead_motion,
     without_front_axle,
 )
-from pre_core.crossing.mismatch import BridgePavement, Mismatch, mismatch_spectra
+from pre_core.crossing.mismatch import BridgePavement, Mismatch, mismatch_spectra, with_axle_roll
 from pre_core.crossing.noise import (
     FRICTION_STATISTIC,
     NoisePath,
@@ -45,7 +45,7 @@ from pre_core.crossing.rows import RESIDUALS, row_count, row_filter
 from pre_core.crossing.step_tables import sinc_table, step_table
 from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_FACTOR
 from pre_core.crossing.whitening import Whitener, solve, whitener
-from pre_core.parameters import FIRST_OF_BRIDGE, TORSION
+from pre_core.parameters import FIRST_OF_BRIDGE, K_U1, M_U1, TORSION
 from pre_core.physics.beam_basis import beam_basis, change_basis
 from pre_core.physics.surface import TYPICAL_FOOTPRINTS, Footprint
 from pre_core.physics.tandem import NO_LEAD, Lead
@@ -125,6 +125,9 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
         no_suspension_noise(),
     )
     shapes = mismatch_spectra(*inputs.footprints)
+    if inputs.lead.ahead_m > 0.0:
+        hop_hz = np.sqrt(theta[K_U1] / theta[M_U1]) / (2.0 * np.pi)
+        shapes = with_axle_roll(shapes, float(hop_hz), speed)
     problem = PosteriorProblem(
         crossing,
         inputs.priors,

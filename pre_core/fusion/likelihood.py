@@ -31,7 +31,7 @@ from pre_core.crossing.compliances import (
     without_priors,
 )
 from pre_core.crossing.fit import Optimum
-from pre_core.crossing.mismatch import long_wave_power
+from pre_core.crossing.mismatch import TRACK_SHAPES, long_wave_power
 from pre_core.crossing.nuisances import ResidualParts, nuisances_of
 from pre_core.crossing.preparation import replace_mismatch
 from pre_core.crossing.response_surface import response_surface
@@ -138,7 +138,7 @@ def likelihood(
         _coordinates(problem, bridge),
         _coordinates(problem, truck),
         grid[inner],
-        mismatch.level_m3 * long_wave_power(mismatch),
+        mismatch.level_m3[:TRACK_SHAPES] * long_wave_power(mismatch),
         off_bridge_mismatch(found) if differs else None,
         bends,
         _response_to_short_waves(found) if differs and with_bends else None,
