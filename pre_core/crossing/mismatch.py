@@ -41,6 +41,9 @@ _WORN = 0.9
 _GRID_CYCLES_PER_M = 0.02
 TRACK_SHAPES = 2
 """Number of spectra that belong to the axles' tracks: of unequal tyres, and of an offset."""
+_CLEAR_ROLL = 10.0
+"""Rise of the statistic of levels above which axles roll. Of 30 roads without roll it was 3.8 in
+the mean, above 10 in one; of 30 with a damping ratio of 0.05, 22 in the mean."""
 _ROLL_STEP = 0.125
 _ROLL_BANDS = np.exp(_ROLL_STEP * np.arange(0, 7))
 """Middles of the bands of the axles' roll relative to the frequency of an axle on its tyres. The
@@ -381,16 +384,30 @@ def surface_level(
 
 
 def estimate_levels(
-    segments: list[PeriodogramSegment], typical: FloatArray | None = None
+    segments: list[PeriodogramSegment], typical: FloatArray, bands: int = 0
 ) -> tuple[FloatArray, float]:
     """Return the most likely levels (s,) in m³ (Whittle's likelihood), and a statistic.
 
     `typical` (s,) are the means of their exponential priors, infinite without one; the statistic is
-    that of `maximum_likelihood_levels`.
+    that of `maximum_likelihood_levels`. The last `bands` of the levels, of axles that roll, are
+    zero unless they raise it by `_CLEAR_ROLL`: free levels would take what chance adds in a band,
+    and the others would be a tenth too low.
     """
+    if bands == 0:
+        return _most_likely_levels(segments, typical)
+    fewer = [one._replace(shapes=one.shapes[:-bands]) for one in segments]
+    level, statistic = _most_likely_levels(fewer, typical[:-bands])
+    with_roll, higher = _most_likely_levels(segments, typical)
+    if higher > statistic + _CLEAR_ROLL:
+        return with_roll, higher
+    return np.append(level, np.zeros(bands)), statistic
+
+
+def _most_likely_levels(
+    segments: list[PeriodogramSegment], typical: FloatArray
+) -> tuple[FloatArray, float]:
     seen = np.concatenate([one.seen for one in segments])
     known = np.concatenate([one.sensors for one in segments])
     shape = np.concatenate([one.shapes for one in segments], axis=1)
     start = np.full(shape.shape[0], np.mean(seen) / np.mean(shape.sum(axis=0)))
-    claimed = 0.0 if typical is None else 2.0 / typical
-    return maximum_likelihood_levels(seen, known, shape, start, claimed, _ENOUGH)
+    return maximum_likelihood_levels(seen, known, shape, start, 2.0 / typical, _ENOUGH)

@@ -308,14 +308,15 @@ def mismatch_levels(
     metres = rows.every * rows.step_s * road.speed_m_per_s
     surface = _mismatch.surface_level(shapes, whole, [metres * one.size for one in roads])
     expected = surface * shapes.expected_m
-    usual = np.append([np.inf, expected[1]], np.full(expected.size - 2, np.inf))
+    bands = expected.size - _mismatch.TRACK_SHAPES
+    usual = np.append([np.inf, expected[1]], np.full(bands, np.inf))
     parts = [_mismatch.tapered_periodogram(one, of_sensors, of_shapes[:-1]) for one in stretches]
     if not has_only_offset:
-        level, statistic = _mismatch.estimate_levels(parts, usual)
+        level, statistic = _mismatch.estimate_levels(parts, usual, bands)
         if level[0] >= _EQUAL_TYRES * expected[0]:
             return level, statistic, expected
     alike = [part._replace(shapes=part.shapes[1:]) for part in parts]
-    offset, statistic = _mismatch.estimate_levels(alike, usual[1:])
+    offset, statistic = _mismatch.estimate_levels(alike, usual[1:], bands)
     return np.append(0.0, offset), statistic, expected
 
 
