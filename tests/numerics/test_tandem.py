@@ -13,7 +13,12 @@ import pytest
 from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import front_axle, posterior
 from pre_core.crossing.fit import Optimum
-from pre_core.crossing.mismatch import BridgePavement, tapered_periodogram
+from pre_core.crossing.mismatch import (
+    TRACK_SHAPES,
+    BridgePavement,
+    mismatch_spectra,
+    tapered_periodogram,
+)
 from pre_core.crossing.noise import no_suspension_noise
 from pre_core.crossing.off_bridge import _levels_off_bridge, off_bridge_residuals
 from pre_core.crossing.pavement import estimate_pavement
@@ -388,8 +393,25 @@ def test_noise_of_the_front_axle_is_white_once_whitened() -> None:
     assert power == pytest.approx(np.ones(power.size), abs=5.0 * np.sqrt(2.0 / len(powers)))
 
 
+def without_roll(problem: PosteriorProblem) -> PosteriorProblem:
+    """Return the problem with the spectra of the axles' tracks alone."""
+    road = problem.mismatch
+    shapes = mismatch_spectra(*road.shapes.footprints)
+    return problem._replace(
+        mismatch=road._replace(shapes=shapes, level_m3=road.level_m3[:TRACK_SHAPES])
+    )
+
+
+def test_axles_that_only_roll_have_no_offset() -> None:
+    problem, y = on_a_surface()  # both axles are 5 mm beside their sensors
+    levels = _levels_off_bridge(problem, y)[0]
+    assert levels[TRACK_SHAPES:].max() > 0.0
+    assert levels[1] < 1e-3 * _levels_off_bridge(without_roll(problem), y)[0][1]
+
+
 def test_waves_by_the_front_axle_are_no_roughness_of_the_deck() -> None:
-    problem, y = on_a_surface()
+    rolling, y = on_a_surface()
+    problem = without_roll(rolling)
     level = _levels_off_bridge(problem, y)[0]
     response = front_axle.front_axle_response(problem, y)
     assert response is not None
@@ -407,7 +429,7 @@ def test_waves_by_the_front_axle_are_no_roughness_of_the_deck() -> None:
 
 def test_equal_tyres_of_a_tandem_differ_by_an_offset_only() -> None:
     problem, y = on_a_surface()
-    levels = _levels_off_bridge(problem, y)[0]
+    levels = _levels_off_bridge(without_roll(problem), y)[0]
     assert levels[0] == 0.0 < levels[1]
 
 
