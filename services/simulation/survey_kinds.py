@@ -37,7 +37,8 @@ class SurveyKind(NamedTuple):
     anisotropy: float = 1.0
     """Lateral correlation length of the surface over that of an isotropic one."""
     has_tandem: bool = False
-    """A truck with an equalised tandem on a surface; `offset_m` is that of its second axle."""
+    """Trucks without a mass of their own have an equalised tandem, on a surface; `offset_m` is that
+    of its second axle."""
     friction_share: float = 0.0
     """Friction of its springs over their static load."""
 
@@ -68,6 +69,7 @@ KINDS: Final = {
     "tandem-rubbing": SurveyKind(12, has_tandem=True, friction_share=0.08),
     "tandem-aside": SurveyKind(12, has_tandem=True, offset_m=0.02),
     "tandem-weak": SurveyKind(8, has_tandem=True, ei_ratios=(1.0, 1.0, 0.8, 1.0, 1.0, 1.0, 1.0)),
+    "mixed-fleet": SurveyKind(12, tyres="single", masses_kg=(None, _LORRY_KG), has_tandem=True),
     "everything": SurveyKind(16, tyres="twin", masses_kg=(_LORRY_KG,), everything=True),
     "scenario-1": SurveyKind(16, scenario=1, noise_ug_per_rthz=100.0),
     "scenario-4": SurveyKind(16, scenario=4, noise_ug_per_rthz=100.0),

@@ -50,7 +50,7 @@ def _plan(site: Site, kind: SurveyKind) -> Plan:
 
 
 def _with_wheels(site: Site, kind: SurveyKind) -> Site:
-    if kind.has_tandem:
+    if site.vehicles[0].tandem is not None:
         return _with_offset(site, kind.offset_m)
     if kind.tyres is None:
         return site

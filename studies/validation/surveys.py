@@ -81,7 +81,7 @@ def one_crossing(
 def _driven(site: Site, of: SurveyKind, survey: int, number: int, truck: int) -> tuple[Run, Site]:
     """Return the recorded run of a crossing, and the site that declares its sensors."""
     truth, seed = crossing_truth(site, of, survey, number, truck)
-    if of.has_tandem:
+    if site.vehicles[0].tandem is not None:
         world = TandemWorld(of.friction_share, of.offset_m, wander_m=of.wander_m)
         return drawn_tandem(site, truth, seed, 1000 * survey + truck, world).recorded
     one = drive(site, truth, seed)
@@ -91,9 +91,9 @@ def _driven(site: Site, of: SurveyKind, survey: int, number: int, truck: int) ->
 def site_of_truck(site: Site, kind: SurveyKind, truck: int) -> Site:
     """Return the owner's site file for a truck of a survey."""
     vehicle, bridge = site.vehicles[0], site.bridges[0]
-    if kind.has_tandem:
-        vehicle = usual_tandem(kind.noise_ug_per_rthz)
     mass = kind.masses_kg[truck]
+    if mass is None and kind.has_tandem:
+        vehicle = usual_tandem(kind.noise_ug_per_rthz)
     if mass is not None:
         vehicle = _of_mass(vehicle, mass).model_copy(update={"id": f"truck-{truck}"})
     if kind.elements is not None:
@@ -105,11 +105,12 @@ def sites_of(site: Site, kind: SurveyKind) -> list[Site]:
     """Return the declared sites of each truck of a survey, with its sensors."""
     axles = kind.noise_ug_per_rthz
     body = _BODY_NOISE_UG if kind.everything else axles
-    if kind.has_tandem:
-        return [middle_site(site_of_truck(site, kind, 0))]
+    of_trucks = [site_of_truck(site, kind, truck) for truck in range(len(kind.masses_kg))]
     return [
-        declared_site(site_of_truck(site, kind, truck), (body, body, axles, axles), _RATE_HZ)
-        for truck in range(len(kind.masses_kg))
+        declared_site(one, (body, body, axles, axles), _RATE_HZ)
+        if one.vehicles[0].tandem is None
+        else middle_site(one)
+        for one in of_trucks
     ]
 
 
@@ -168,7 +169,7 @@ def crossing_truth(
         body_noise_ug_per_rthz=_BODY_NOISE_UG if kind.everything else None,
     )
     paths = None
-    if kind.tyres is not None:
+    if kind.tyres is not None and site.vehicles[0].tandem is None:
         pavement = Pavement(kind.deck_roughness, kind.largest_joint_m, kind.anisotropy)
         asked = SurfaceOptions(kind.tyres, kind.offset_m, kind.wander_m, pavement)
         paths = wheel_paths_of(site.vehicles[0], asked)

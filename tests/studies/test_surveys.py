@@ -80,6 +80,23 @@ def test_what_was_driven_before_has_its_truth_still() -> None:
             assert np.array_equal(surveys._survey_truth(of, kind, 3), drawn), name
 
 
+def test_trucks_of_a_mixed_fleet_cross_the_same_bridge() -> None:
+    site, kind = default_site(), KINDS["mixed-fleet"]
+    of_trucks = [surveys.site_of_truck(site, kind, truck) for truck in (0, 1)]
+    assert [one.vehicles[0].tandem is None for one in of_trucks] == [False, True]
+    truths = [
+        surveys.crossing_truth(of, kind, 2, truck, truck)[0] for truck, of in enumerate(of_trucks)
+    ]
+    tandem, lorry = truths
+    rigidity = tandem.beam.flexural_rigidity_nm2
+    np.testing.assert_array_equal(rigidity, lorry.beam.flexural_rigidity_nm2)
+    # The simulation with two sides has wheel paths of its own.
+    assert tandem.paths is None
+    assert lorry.paths is not None
+    declared = surveys.sites_of(site, kind)
+    assert [one.vehicles[0].tandem is None for one in declared] == [False, True]
+
+
 def record(kind: str, survey: int, number: int) -> Record:
     return {
         "effect": kind,
