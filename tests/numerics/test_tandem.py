@@ -20,7 +20,7 @@ from pre_core.crossing.mismatch import (
     tapered_periodogram,
 )
 from pre_core.crossing.noise import no_suspension_noise
-from pre_core.crossing.off_bridge import _levels_off_bridge, off_bridge_residuals
+from pre_core.crossing.off_bridge import _levels_off_bridge, mismatch_excess, off_bridge_residuals
 from pre_core.crossing.pavement import estimate_pavement
 from pre_core.crossing.posterior import ChainageFixes, PosteriorProblem, Priors
 from pre_core.crossing.preparation import (
@@ -407,6 +407,7 @@ def test_axles_that_only_roll_have_no_offset() -> None:
     levels = _levels_off_bridge(problem, y)[0]
     assert levels[TRACK_SHAPES:].max() > 0.0
     assert levels[1] < 1e-3 * _levels_off_bridge(without_roll(problem), y)[0][1]
+    assert mismatch_excess(problem, y) < 1e-3
 
 
 def test_waves_by_the_front_axle_are_no_roughness_of_the_deck() -> None:
