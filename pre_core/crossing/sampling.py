@@ -182,8 +182,13 @@ def _alike_tyres_draws(
     squares = partial(exact_squares, nuisances)
     weighted = draw_curved(found, squares, draws, seed, inflation, report)
     if weighted.worth.ess < _LEAST_ESS:
-        chains = _compliance_draws(found, draws, seed, inflation)
-        chains = chains._replace(ending=Termination.STEPS_EXHAUSTED)
+        # Diagnostics are of the draws that failed, not of those in their place.
+        chains = _compliance_draws(found, draws, seed, inflation)._replace(
+            ess=weighted.worth.ess,
+            acceptance=weighted.worth.ess / weighted.y.shape[0],
+            pareto_k=weighted.worth.pareto_k,
+            ending=Termination.STEPS_EXHAUSTED,
+        )
     else:
         chains = _completed_to_chains(found, weighted, draws, seed, inflation)
     return chains._replace(evaluations=nuisances.evaluations + 2 * weighted.y.shape[0])

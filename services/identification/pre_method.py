@@ -269,7 +269,8 @@ def _diagnostics_of_draws(chain: PosteriorDraws) -> dict[str, float]:
         "draws": float(chain.draws.shape[0] * chain.draws.shape[1]),
         "chain_evaluations": float(chain.evaluations),
     }
-    if chain.pareto_k is not None:
+    # One draw with all the weight makes it infinite, which no number of a result may be.
+    if chain.pareto_k is not None and np.isfinite(chain.pareto_k):
         diagnostics["pareto_k"] = chain.pareto_k
     return diagnostics
 

@@ -23,7 +23,7 @@ MAX_PICTURES = 12
 _COLUMNS = 6
 """Maximum number of crossings next to each other in a table of measures."""
 _COLUMNS_WITH_MEANINGS = 3
-_DIAGNOSTICS = ("r_hat", "ess", "position_shift_m", "line_hz")
+_DIAGNOSTICS = ("r_hat", "ess", "pareto_k", "position_shift_m", "line_hz")
 
 Numbered = tuple[int, CrossingResult]
 

@@ -23,6 +23,7 @@ from services.planning.plan_survey import SurveyWishes
 from services.report import pdf
 from services.report.advice import next_steps
 from services.report.bridge import LARGEST_MISSED_LOSS, _finding, bridge_reports
+from services.report.evidence import measures_of
 from services.report.html import Html, inlined_svg, joined, tag
 from services.report.page import page
 from services.report.place import ends_of, start_of
@@ -106,6 +107,14 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     assert "truck-1: 9.5 t, wheelbase 4.4 m, axle loads" in text
     assert "front and rear on body and axles" in text
     assert "Computed 2026-09-21 " in text
+
+
+def test_measures_name_the_criterion_of_weighted_draws(site: Site) -> None:
+    (known,) = results_of(site, some_crossing("a"), used="a").crossings
+    one = known.model_copy(update={"diagnostics": {**known.diagnostics, "pareto_k": 0.719}})
+    (added,) = set(measures_of(one, ENGLISH)) - set(measures_of(known, ENGLISH))
+    assert (added.name, added.value) == ("pareto_k", "0.719")
+    assert ENGLISH.text("meaning.pareto_k").endswith("at most 0.7 is needed")
 
 
 def test_measures_of_many_crossings_keep_their_meanings_readable(site: Site) -> None:
