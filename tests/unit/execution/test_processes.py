@@ -240,7 +240,7 @@ def test_one_that_hangs_at_a_later_start_costs_one_crossing(
     monkeypatch.setenv("DEADLY_ONCE", str(tmp_path))
     first, second = works()
     with ProcessExecutor(
-        1, identify=deadly_once, prepare=sleep_at_the_second_start, limits=TaskLimits(idle_s=1.0)
+        1, identify=deadly_once, prepare=sleep_at_the_second_start, limits=TaskLimits(idle_s=4.0)
     ) as processes:
         processes.wait_until_warm()
         processes.submit(first)
