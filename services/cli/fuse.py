@@ -1,10 +1,11 @@
 """The command `driveby fuse`: one estimate of each bridge from stored results."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.results import Results, load_results, results_json
+from schemas.results import BridgeResult, Results, load_results, results_json
+from schemas.site_file import load_site
 from services.cli.bridge_table import print_bridge
 from services.cli.identify import print_validation, warn_of_shared_crossings
 from services.cli.settings import FuseOptions
@@ -18,6 +19,7 @@ from services.history.validation_files import (
     pairs_with_intervals,
     pairs_without_validation,
 )
+from services.ledger.baselines import baselines_of
 from services.ledger.site_of_results import site_of_results
 
 if TYPE_CHECKING:
@@ -44,7 +46,7 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
             "newest counts",
             highlight=False,
         )
-    stored = None if baseline is None else (str(baseline), load_results(baseline))
+    stored = _baselines(baseline, asked.site)
     with parts_bar("fusing bridge", len(found.by_bridge), console) as report:
         fused = fuse_crossings(
             str(paths[0]), found, stored, report, fuse_suspect=asked.fuse_suspect
@@ -58,10 +60,22 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
     newest, _ = max(zip(paths, files, strict=True), key=lambda one: one[1].created)
     _print_validations(console, newest, fused.results, asked)
     if stored is not None:
-        warn_of_shared_crossings(fused.results.bridges, stored[1].bridges)
+        warn_of_shared_crossings(fused.results.bridges, stored[1])
     if json_path is not None:
         write_atomically(json_path, results_json(fused.results))
     return 0
+
+
+def _baselines(
+    given: Path | None, site: Path | None
+) -> tuple[str, Mapping[str, BridgeResult]] | None:
+    """Return the states to compare with, and their file: as given, else as the site file names."""
+    if given is not None:
+        return str(given), load_results(given).bridges
+    if site is None:
+        return None
+    named = baselines_of(load_site(site), site.parent)
+    return (str(site), named) if named else None
 
 
 def _print_validations(

@@ -1,7 +1,7 @@
 """Fusion of the crossings of several results files, each crossing once."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -74,17 +74,18 @@ def crossings_to_fuse(name: str, files: Sequence[Results]) -> CrossingsToFuse:
 def fuse_crossings(
     name: str,
     found: CrossingsToFuse,
-    stored: tuple[str, Results] | None,
+    stored: tuple[str, Mapping[str, BridgeResult]] | None,
     report: Parts,
     *,
     fuse_suspect: bool,
 ) -> FusedResults:
     """Fuse the crossings of each bridge.
 
-    `stored` is a baseline with the name of its file. Raise InputError if it does not fit, or if no
-    crossing can be fused; `name` is the place that such an error begins with.
+    `stored` are states to compare with, by bridge, and the name of their file. Raise InputError if
+    one does not fit, or if no crossing can be fused; `name` is the place that such an error begins
+    with.
     """
-    baselines = {} if stored is None else stored[1].bridges
+    baselines = {} if stored is None else stored[1]
     fusing = FusionSettings(baselines, fuse_suspect, IdentificationSettings().threads)
     elements_of = {bridge: _elements(bridge, of) for bridge, of in found.by_bridge.items()}
     for bridge, elements in elements_of.items():

@@ -142,23 +142,21 @@ def fuse(
     each = [_results("source", one) for one in sources]
     check_identifiers(each)
     found = crossings_to_fuse(name, each)
-    stored = None
-    if baseline is not None:
-        place = str(baseline) if isinstance(baseline, str | PathLike) else "baseline"
-        stored = (place, _results("baseline", baseline))
+    stored = None if baseline is None else _results("baseline", baseline)
+    place = str(baseline) if isinstance(baseline, str | PathLike) else "baseline"
     with one_blas_thread():
         fused = fuse_crossings(
             name,
             found,
-            stored,
+            None if stored is None else (place, stored.bridges),
             lambda bridge, stage, share: None,
             fuse_suspect=fuse_suspect,
         )
     if stored is not None:
-        for line in baseline_cautions(fused.results.bridges, stored[1].bridges):
+        for line in baseline_cautions(fused.results.bridges, stored.bridges):
             warnings.warn(line, stacklevel=3)
     known = _newest_site(sources) if site is None else given_site(site)
-    return Fusion(fused.results, fused.bridges, known, None if stored is None else stored[1])
+    return Fusion(fused.results, fused.bridges, known, stored)
 
 
 def _results(name: str, source: object) -> Results:

@@ -55,6 +55,23 @@ def test_element_weak_in_the_baseline_is_named(
     assert words in finding
 
 
+def test_baseline_of_the_site_file_is_compared_with(tmp_path: Path) -> None:
+    first = write(tmp_path / "first.json", [crossing(n) for n in range(2)])
+    assert main(["fuse", str(first), "--json", str(tmp_path / "before.json")]) == 0
+    bridge = paper_site().bridges[0].model_copy(update={"baseline": "before.json", "elements": 5})
+    site = tmp_path / "site.toml"
+    site.write_text(site_toml(paper_site().model_copy(update={"bridges": (bridge,)})))
+    second = write(tmp_path / "second.json", [crossing(n) for n in range(2, 4)])
+    states = []
+    for options in (["--site", str(site)], ["--baseline", str(tmp_path / "before.json")], []):
+        now = tmp_path / "now.json"
+        assert main(["fuse", str(second), *options, "--json", str(now)]) == 0
+        states.append(load_results(now).bridges["bridge-1"])
+    of_site, given, without = states
+    assert of_site == given
+    assert without.probability_of_loss is None is not given.probability_of_loss
+
+
 @pytest.mark.parametrize("command", ["fuse", "report"])
 def test_a_recording_or_folder_is_refused_with_what_is_wanted(
     command: str, project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
