@@ -284,6 +284,23 @@ def test_a_missed_aim_stands_out_on_page_and_screen() -> None:
     assert max(len(line) for line in text.splitlines()) <= 80
 
 
+def _options(truth: Path, processes: int) -> IntervalOptions:
+    return IntervalOptions(
+        crossings=40,
+        control=5,
+        scenarios=(12,),
+        out_of_model=0,
+        effects=(),
+        records=Path("unused"),
+        truth=truth,
+        site=None,
+        processes=processes,
+        json=None,
+        figures=None,
+        page=None,
+    )
+
+
 @pytest.mark.parametrize(("verdict", "code"), [("good", 0), ("suspect", 1)])
 def test_the_command_ends_with_1_where_an_aim_is_missed(
     monkeypatch: pytest.MonkeyPatch, verdict: str, code: int
@@ -291,20 +308,7 @@ def test_the_command_ends_with_1_where_an_aim_is_missed(
     """The hours of computing are left out: what they gave is made up."""
     outcome = _outcome()._replace(drawn=made_up(200), judged=[_judged(verdict=verdict)])
     monkeypatch.setattr(run_intervals, "run_parts", lambda *_, **__: outcome)
-    asked = IntervalOptions(
-        crossings=40,
-        control=5,
-        scenarios=(12,),
-        out_of_model=0,
-        effects=(),
-        records=Path("unused"),
-        truth=Path("unused"),
-        site=None,
-        processes=1,
-        json=None,
-        figures=None,
-        page=None,
-    )
+    asked = _options(Path("unused"), processes=1)
     assert run_intervals.run(asked, Console(file=io.StringIO(), width=80)) == code
 
 
@@ -313,20 +317,7 @@ def test_study_announces_its_crossings_before_the_first(
 ) -> None:
     caplog.set_level(logging.INFO, progress_log.name)
     monkeypatch.setattr(uncertainty, "in_processes", _stopped)
-    asked = IntervalOptions(
-        crossings=40,
-        control=5,
-        scenarios=(12,),
-        out_of_model=0,
-        effects=(),
-        records=Path("unused"),
-        truth=tmp_path,
-        site=None,
-        processes=2,
-        json=None,
-        figures=None,
-        page=None,
-    )
+    asked = _options(tmp_path, processes=2)
     with pytest.raises(KeyboardInterrupt):
         run_intervals.run(asked, Console(file=io.StringIO(), width=80))
     noises = len(SCENARIO_NOISE_UG)
