@@ -25,7 +25,7 @@ from pre_core.crossing.noise import (
     folded_spectrum,
     force_masses,
 )
-from pre_core.crossing.rows import RESIDUALS, RowFilter
+from pre_core.crossing.rows import RowFilter
 from pre_core.parameters import M_U1, TORSION
 from pre_core.physics.torsion import NO_TORSION, TorsionBasis, mean_receptance
 
@@ -42,6 +42,82 @@ class ComparedStretch(NamedTuple):
     """The deck that carries the stretch, if it twists."""
 
 
+class MismatchWeights(NamedTuple):
+    """Weights of a truck's equations in the correlation of its residuals with the mismatch."""
+
+    omega: FloatArray  # (f,)
+    weight: NDArray[np.complex128]
+    """Weights (4, 4, f) of the equations (`noise.estimation_matrix`) of any truck."""
+    torsion: TorsionBasis
+    receptance: NDArray[np.complex128]
+    """Mean receptance (f,) of the twisting deck at the flexibility of the first truck's bridge."""
+
+
+def mismatch_weights(
+    rows: RowFilter,
+    truck: NoisePath,
+    channels: GainsAndDelays,
+    density: FloatArray,
+    force: FloatArray,
+    stretch: ComparedStretch,
+) -> MismatchWeights:
+    """Return the weights for the residuals of a truck, its `channels` those of one point (1, 4).
+
+    With M_k M_0^-1 another truck mixes the input profiles, which differ by d; the front axle's
+    residuals are taken when its wheel was at the rear's present place. `density` (4,) is that of
+    the sensors, `force` (2, shapes) the suspension noise in N²/Hz. Of the deck only the torsional
+    flexibility may differ.
+    """
+    at = folded(rows, _FREQUENCIES)
+    road, deck = stretch.mismatch, stretch.torsion
+    near = np.linalg.inv(folded_spectrum(at, truck, density, force, road))[:, 0].T
+    white = np.concatenate([near, near.conj()], axis=1) / _FREQUENCIES
+    omega = np.concatenate([at.below, at.above])
+    power = np.concatenate([at.power_below, at.power_above])
+    of_front, of_rear = (omega**4 * power * one for one in _mismatch.cross_spectra(road, omega))
+    turn = np.exp(1j * omega * stretch.wheelbase_m / road.speed_m_per_s)
+    # Of the mixed profiles, by residual: d itself, then both body equations.
+    mixed = np.zeros((4, 4, omega.size), dtype=np.complex128)
+    mixed[0, 0], mixed[0, 1] = white[0] * of_front, white[0] * of_rear * turn.conj()
+    mixed[1, 0], mixed[1, 1] = -white[0] * of_front * turn, -white[0] * of_rear
+    mixed[2, 0], mixed[2, 1] = white[1] * of_front, white[1] * of_rear * turn.conj()
+    mixed[3, 0], mixed[3, 1] = white[2] * of_front * turn, white[2] * of_rear
+    unmixed = MismatchWeights(omega, mixed, deck, mean_receptance(deck, truck.theta, omega))
+    equations = _equations(unmixed, truck)
+    equations *= channel_factors(omega, channels.gain[0], channels.delay_s[0])
+    inverse = np.linalg.inv(np.moveaxis(equations, 2, 0))
+    weight = np.moveaxis(np.moveaxis(mixed, 2, 0) @ np.swapaxes(inverse, 1, 2), 0, 2)
+    return unmixed._replace(weight=np.ascontiguousarray(weight))
+
+
+def correlation(
+    of: MismatchWeights, truck: NoisePath, gain: FloatArray, delay_s: FloatArray
+) -> float:
+    """Return E[r' C_0^-1 r_k] per residual sample by the mismatch alone.
+
+    With r the residuals of the first truck and r_k those of `truck`, `gain` (4,) and `delay_s`
+    (4,) those of its channels.
+    """
+    equations = _equations(of, truck) * channel_factors(of.omega, gain, delay_s)
+    return float(np.vdot(of.weight.conj(), equations).real)
+
+
+def channel_factors(
+    omega: FloatArray, gain: FloatArray, delay_s: FloatArray
+) -> NDArray[np.complex128]:
+    """Return the factors (4, f) of channels with relative gain errors (4,) and delays (4,)."""
+    return np.asarray((1.0 + gain)[:, None] * np.exp(1j * np.outer(delay_s, omega)))
+
+
+def _equations(of: MismatchWeights, truck: NoisePath) -> NDArray[np.complex128]:
+    """Return the equations (4, 4, f) of a truck, of profiles less each axle's own deflection."""
+    equations = estimation_matrix(truck, of.omega)
+    if of.receptance.any():
+        flexibility = truck.theta[TORSION] * of.torsion.load_factor
+        equations[:2] -= of.omega**2 * (flexibility * of.receptance) * _axle_masses(truck)
+    return equations
+
+
 def mismatch_power(
     rows: RowFilter,
     trucks: list[NoisePath],
@@ -52,44 +128,15 @@ def mismatch_power(
 ) -> FloatArray:
     """Return E[r' C_0^-1 (r_k - r)] per residual sample by the mismatch alone: (trucks - 1,).
 
-    With r the residuals of the first truck and r_k those of another, each with its `channels`, E =
-    M_k M_0^-1 - 1 describes how the latter mixes the input profiles, which differ by d; the front
-    axle's residuals are taken when its wheel was at the rear's present place. `density` (4,) is
-    that of the sensors, `force` (2, shapes) the suspension noise in N²/Hz. Of the deck only the
-    torsional flexibility may differ.
+    With r the residuals of the first truck and r_k those of another, each with its `channels`;
+    the others are those of `mismatch_weights`.
     """
-    at = folded(rows, _FREQUENCIES)
-    road = stretch.mismatch
-
-    def crossed(omega: FloatArray, power: FloatArray) -> NDArray[np.complex128]:
-        """(w, 3, f): E[(r_k - r)_l conj(r_0)], of which r_0, the mismatch, is d itself."""
-        s = 1j * omega
-        deck = stretch.torsion
-        receptance = mean_receptance(deck, trucks[0].theta, omega)
-
-        def estimation(k: int) -> NDArray[np.complex128]:
-            channel = (1.0 + channels.gain[k])[:, None] * np.exp(np.outer(channels.delay_s[k], s))
-            equations = estimation_matrix(trucks[k], omega)
-            if receptance.any():
-                flexibility = trucks[k].theta[TORSION] * deck.load_factor
-                equations[:2] -= omega**2 * (flexibility * receptance) * _axle_masses(trucks[k])
-            return np.moveaxis(equations * channel, 2, 0)
-
-        inverse = np.linalg.inv(estimation(0))
-        of_front, of_rear = (omega**4 * power * one for one in _mismatch.cross_spectra(road, omega))
-        turn = np.exp(s * stretch.wheelbase_m / road.speed_m_per_s)
-        out = np.empty((len(trucks) - 1, RESIDUALS, omega.size), dtype=np.complex128)
-        for number in range(len(out)):
-            e = np.moveaxis(estimation(1 + number) @ inverse, 0, 2) - np.eye(4)[:, :, None]
-            out[number, 0] = of_front * (e[0, 0] - turn * e[1, 0])
-            out[number, 0] += of_rear * (turn.conj() * e[0, 1] - e[1, 1])
-            out[number, 1] = of_front * e[2, 0] + of_rear * turn.conj() * e[2, 1]
-            out[number, 2] = of_front * turn * e[3, 0] + of_rear * e[3, 1]
-        return out
-
-    weight = np.linalg.inv(folded_spectrum(at, trucks[0], density, force, road))[:, 0]
-    both = crossed(at.below, at.power_below) + crossed(at.above, at.power_above).conj()
-    return np.einsum("fl,wlf->w", weight, both).real / _FREQUENCIES
+    of = mismatch_weights(rows, trucks[0], channels, density, force, stretch)
+    found = [
+        correlation(of, truck, gain, delay_s)
+        for truck, gain, delay_s in zip(trucks, channels.gain, channels.delay_s, strict=True)
+    ]
+    return np.asarray(found[1:]) - found[0]
 
 
 def _axle_masses(truck: NoisePath) -> FloatArray:

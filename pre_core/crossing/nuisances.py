@@ -9,6 +9,9 @@ would be free to move the truck to where its residuals are not linear, and fit b
 The vibration before the crossing is a wave of the bridge's own frequency, which moves with the
 bridge: removed at the frequency of the optimum it would leave, or take, a wave in the residuals of
 any other bridge. So it is noise here, in the mixture of its waves on the bridges of many points.
+
+A truck that follows a bridge far from the optimum also changes the expected squares of the noise
+(`expected_squares`). What the priors' tangent lacks of them is a residual of its own.
 """
 
 from typing import NamedTuple
@@ -19,6 +22,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from pre_core.arrays import FloatArray
 from pre_core.crossing import posterior
+from pre_core.crossing.expected_squares import ExpectedSquares, expected_squares
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.posterior import PosteriorProblem
 
@@ -26,6 +30,10 @@ _SWINGING = 40
 """Number of points whose waves of the initial vibration are computed for their mixture."""
 _LEAST_WAVE = 0.03
 """Smallest wave that is kept, in standard deviations of a residual."""
+_LEVEL = 10.0
+"""Residual of the expected squares at the optimum: half its square bounds how far they may be above
+their tangent. Far smaller, it would bend where they are below; far larger, curvature of less than
+the smallest that fusion keeps would count."""
 
 
 class ResidualParts(NamedTuple):
@@ -46,7 +54,8 @@ class ResidualParts(NamedTuple):
 class Nuisances(NamedTuple):
     """Nuisances of a crossing, which follow its curved coordinates and offset (n + 1,).
 
-    Residuals (m + r,) include r priors of the mixture of initial vibrations.
+    Residuals (m + r + 1,) include r priors of the mixture of initial vibrations, and the expected
+    squares of the noise.
     """
 
     problem: PosteriorProblem
@@ -60,9 +69,10 @@ class Nuisances(NamedTuple):
     of_own: FloatArray  # (s, n + 1) their slopes
     of_linear: FloatArray  # (t, n + 1) slopes of the linear coordinates
     basis: FloatArray
-    """Orthonormal columns (m + r, s + r) that span all effects of nuisances and mixture."""
+    """Orthonormal columns (m + r + 1, s + r) that span all effects of nuisances and mixture."""
     step: FloatArray
-    """Gauss-Newton step (s, m + r) of the nuisances by the residuals, all else free, too."""
+    """Gauss-Newton step (s, m + r + 1) of the nuisances by the residuals, all else free, too."""
+    expected: ExpectedSquares
     evaluations: int
     """Number of evaluations that they took."""
 
@@ -105,7 +115,9 @@ def nuisances_of(
     swinging[:, parts.curved] = drawn[::every, :-1][: swinging.shape[0]]
     mixture = _swing_waves(problem, swinging, parts.rows)
     r = mixture.shape[1]
-    effects = np.hstack([with_mixture(jacobian[:, own], r), np.vstack([mixture, np.eye(r)])])
+    effects = np.hstack(
+        [with_mixture(jacobian[:, own], r), np.vstack([mixture, np.eye(r), np.zeros((1, r))])]
+    )
     linear, waves = with_mixture(jacobian[:, parts.linear], r), with_mixture(parts.waves, r)
     steps = _steps((effects, linear, waves), parts.wave_precision)
     follow = steps @ with_mixture(jacobian[:, kept], r)
@@ -120,22 +132,23 @@ def nuisances_of(
         follow[begin : begin + linear.shape[1]],
         np.linalg.qr(effects)[0],
         steps[:s],
+        expected_squares(found.problem, found.state.y),
         (1 + swing.size) * swinging.shape[0],
     )
 
 
 def with_mixture(columns: FloatArray, size: int) -> FloatArray:
-    """Return columns (m, n) with zeros for `size` priors of the mixture."""
-    return np.vstack([columns, np.zeros((size, columns.shape[1]))])
+    """Return columns (m, n) with zeros for `size` priors of the mixture, and expected squares."""
+    return np.vstack([columns, np.zeros((size + 1, columns.shape[1]))])
 
 
 def unexplained(of: Nuisances, columns: FloatArray) -> FloatArray:
-    """Return what no nuisance explains of columns (m + r, n)."""
+    """Return what no nuisance explains of columns (m + r + 1, n)."""
     return np.asarray(columns - of.basis @ (of.basis.T @ columns))
 
 
 def integrated_residuals(of: Nuisances, drawn: FloatArray, *, has_step: bool) -> FloatArray:
-    """Return residuals (m + r, k) at points (k, n + 1), with nuisances integrated out.
+    """Return residuals (m + r + 1, k) at points (k, n + 1), with nuisances integrated out.
 
     Each point takes an evaluation, and another one if it `has_step` of its own.
     """
@@ -148,11 +161,14 @@ def integrated_residuals(of: Nuisances, drawn: FloatArray, *, has_step: bool) ->
     points[:, parts.linear] += moves @ of.of_linear.T
     if has_step:
         points[:, of.own] += (of.step @ _residuals(of, points)).T
-    return unexplained(of, _residuals(of, points))
+    residuals = unexplained(of, _residuals(of, points))
+    squares = _LEVEL**2 - 2.0 * of.expected.beyond_tangent(points)
+    residuals[-1] = np.sqrt(np.maximum(squares, 0.0))
+    return residuals
 
 
 def _residuals(of: Nuisances, points: FloatArray) -> FloatArray:
-    """Return residuals (m + r, k) at points y (k, f)."""
+    """Return residuals (m + r + 1, k) at points y (k, f), without the expected squares."""
     return with_mixture(posterior.all_rows(of.problem, points)[:, of.parts.rows].T, of.mixture_size)
 
 

@@ -7,6 +7,7 @@ has none. All other coordinates are integrated out (`nuisances`).
 """
 
 from collections.abc import Callable
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -63,6 +64,11 @@ def residuals_of(surface: ResponseSurface, y: FloatArray) -> FloatArray:
     return np.asarray(surface.constant + u @ surface.slopes.T + products)
 
 
+def parabola_terms(u: FloatArray) -> FloatArray:
+    """Return constant, moves and products (k, p) of moves u (k, n)."""
+    return np.column_stack([np.ones(u.shape[0]), u, _products(u)])
+
+
 def _products(u: FloatArray) -> FloatArray:
     """Return the products (k, pairs) u_i u_j, i <= j by rows, of moves (k, n)."""
     first, second = np.triu_indices(u.shape[1])
@@ -104,30 +110,58 @@ def response_surface(
     )
 
 
+class ParabolaSums(NamedTuple):
+    """Sums over points u (k, n) for parabolas of values (m,) of least squares."""
+
+    gram: FloatArray  # (p, p) of constant, slopes and products
+    image: FloatArray  # (p, m)
+    squares: float
+    points: float
+
+
+def sums_of(u: FloatArray, values: FloatArray, weight: FloatArray | None = None) -> ParabolaSums:
+    """Return the sums of values (m, k) at points u (k, n), which count by `weight` (k,)."""
+    design = parabola_terms(u)
+    if weight is not None:
+        design, values = design * np.sqrt(weight)[:, None], values * np.sqrt(weight)
+    return ParabolaSums(
+        design.T @ design, design.T @ values.T, float(np.sum(values * values)), u.shape[0]
+    )
+
+
+def added(one: ParabolaSums, other: ParabolaSums) -> ParabolaSums:
+    """Return the sums over the points of both."""
+    return ParabolaSums(
+        one.gram + other.gram,
+        one.image + other.image,
+        one.squares + other.squares,
+        one.points + other.points,
+    )
+
+
+def parabolas(of: ParabolaSums) -> tuple[FloatArray, FloatArray]:
+    """Return constant, slopes and products (m, p) of the values, and their error.
+
+    The error (p, p) is the covariance that the remainder causes, summed over the m values.
+    """
+    normal = of.gram.copy()
+    normal[1:, 1:] += _RIDGE * np.eye(normal.shape[0] - 1)
+    inverse = cho_solve(cho_factor(normal), np.eye(normal.shape[0]))
+    fitted = inverse @ of.image
+    degrees = max(1.0, of.points - float(np.sum(inverse * of.gram)))
+    remainder = (of.squares - float(np.sum(fitted * of.image))) / degrees
+    return np.asarray(fitted.T), remainder * inverse
+
+
 def _fit_parabolas(
     u: FloatArray, values_at: Callable[[slice], FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return constant, slopes and products (m, p) of values at points u (k, n), and their error.
+    """Return the `parabolas` of values at points u (k, n).
 
-    `values_at` returns those (m, …) of some points, so that not all are in memory. The error (p, p)
-    is the covariance that the remainder causes, summed over the m values.
+    `values_at` returns those (m, …) of some points, so that not all are in memory.
     """
-    design = np.column_stack([np.ones(u.shape[0]), u, _products(u)])
-    gram = design.T @ design
-    normal = gram.copy()
-    normal[1:, 1:] += _RIDGE * np.eye(normal.shape[0] - 1)
-    image: FloatArray | float = 0.0
-    squares = 0.0
-    for first in range(0, u.shape[0], _TOGETHER):
-        some = slice(first, first + _TOGETHER)
-        values = values_at(some)
-        image = image + design[some].T @ values.T
-        squares += float(np.sum(values * values))
-    inverse = cho_solve(cho_factor(normal), np.eye(normal.shape[0]))
-    fitted = inverse @ image
-    degrees = max(1.0, u.shape[0] - float(np.sum(inverse * gram)))
-    remainder = (squares - float(np.sum(fitted * image))) / degrees
-    return np.asarray(fitted.T), remainder * inverse
+    parts = [slice(first, first + _TOGETHER) for first in range(0, u.shape[0], _TOGETHER)]
+    return parabolas(reduce(added, (sums_of(u[some], values_at(some)) for some in parts)))
 
 
 def _root_of_squares(columns: FloatArray, error: FloatArray) -> FloatArray:

@@ -4,7 +4,6 @@ Draws of a cheap density near the posterior (`surrogate`) are weighted by the po
 that density for the next draws. All batches are weighted as draws of one mixture density.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,8 +17,7 @@ from pre_core.crossing.mismatch import has_alike_tyres
 from pre_core.crossing.surface_posterior import (
     complete,
     draw_curved,
-    exact_squares,
-    nuisances_at_optimum,
+    drawn_by_residuals,
     surface_posterior,
 )
 from pre_core.crossing.weighted_draws import (
@@ -178,9 +176,7 @@ def _alike_tyres_draws(
 
     The others, linear in c, had errors of six standard deviations where those did not converge.
     """
-    nuisances = nuisances_at_optimum(found, inflation, seed)
-    squares = partial(exact_squares, nuisances)
-    weighted = draw_curved(found, squares, draws, seed, inflation, report)
+    weighted, evaluations = drawn_by_residuals(found, draws, seed, inflation, report)
     if weighted.worth.ess < _LEAST_ESS:
         # Diagnostics are of the draws that failed, not of those in their place.
         chains = _compliance_draws(found, draws, seed, inflation)._replace(
@@ -191,7 +187,7 @@ def _alike_tyres_draws(
         )
     else:
         chains = _completed_to_chains(found, weighted, draws, seed, inflation)
-    return chains._replace(evaluations=nuisances.evaluations + 2 * weighted.y.shape[0])
+    return chains._replace(evaluations=evaluations)
 
 
 def _completed_to_chains(

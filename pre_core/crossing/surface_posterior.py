@@ -9,6 +9,7 @@ surface, both widened.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ from pre_core.crossing.nuisances import (
     nuisances_of,
     place_of_offset,
 )
+from pre_core.crossing.residual_draws import DrawnDensity, residual_draws
 from pre_core.crossing.response_surface import (
     POINTS,
     POINTS_OF_DRAWS,
@@ -34,13 +36,21 @@ from pre_core.crossing.response_surface import (
     residuals_of,
     response_surface,
 )
-from pre_core.crossing.weighted_draws import WeightedDraws, importance_draws, is_enough
+from pre_core.crossing.weighted_draws import (
+    WeightedDraws,
+    batch_size,
+    importance_draws,
+    is_enough,
+)
 from pre_core.search import convergence, importance
+from pre_core.search.latent import LatentCoordinates
 from pre_core.search.loop import Report
 
 _WIDENED = 2.0
 """Noise of the densities from which points are drawn, relative to the crossing's: the truth is
 seldom outside, and is where many crossings are linearised in fusion."""
+_WIDER = 1.2
+"""The same for the first points of draws by the residuals."""
 _FIRST_POINTS = 320
 """Number of points of the first surface, which only says where the second is wanted."""
 
@@ -73,9 +83,36 @@ def nuisances_on(found: Optimum, points: FloatArray) -> Nuisances:
     return nuisances_of(found, problem, found.state.jacobian, parts, points)
 
 
-def exact_squares(of: Nuisances, y: FloatArray) -> FloatArray:
-    """Return sums of squares (k,) of the residuals themselves at points y (k, n + 1)."""
-    return np.asarray(np.sum(integrated_residuals(of, y, has_step=True) ** 2, axis=0))
+def drawn_by_residuals(
+    found: Optimum, draws: int, seed: int, inflation: float, report: Report
+) -> tuple[WeightedDraws, int]:
+    """Return weighted draws (k, n + 1) by the residuals themselves, and their evaluations."""
+    nuisances = nuisances_at_optimum(found, inflation, seed)
+    curved = curved_coordinates(found)
+    half_normal = np.searchsorted(curved, posterior.layout(found.problem).half_normal)
+    odds = posterior.log_odds_of_absence(found.problem, inflation)[nuisances.kept]
+    density = DrawnDensity(
+        partial(integrated_residuals, nuisances, has_step=True),
+        partial(_prior_squares, _prior_centres(found)),
+        LatentCoordinates(half_normal, odds),
+        inflation,
+    )
+    first = _points_of_normal(found, batch_size(draws), _WIDER * inflation, seed)
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 25,)))
+    weighted = residual_draws(density, first, draws, rng, report)
+    points = first.shape[0] + weighted.y.shape[0]
+    return weighted, nuisances.evaluations + 2 * points
+
+
+def _prior_centres(found: Optimum) -> FloatArray:
+    """Return the centres (n,) of the curved coordinates' priors (`posterior.all_rows`)."""
+    centres = np.pad(found.problem.noise_slope, (0, found.state.y.size))
+    return np.asarray(centres[curved_coordinates(found)])
+
+
+def _prior_squares(centres: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the squares (k,) of the priors of curved coordinates at points y (k, n + 1)."""
+    return np.asarray(np.sum((y[:, :-1] - centres) ** 2, axis=1))
 
 
 def curved_coordinates(found: Optimum) -> NDArray[np.int64]:
@@ -146,13 +183,11 @@ def draw_curved(
     `squares` returns the sums of squares (k,) of the residuals there, without the priors of the
     curved coordinates. Unless they `may_be_absent`, springs and bearings are present in all.
     """
-    problem, curved = found.problem, curved_coordinates(found)
-    kept = np.append(curved, place_of_offset(problem))
-    centres = np.pad(problem.noise_slope, (0, found.state.y.size))[curved]
+    kept = np.append(curved_coordinates(found), place_of_offset(found.problem))
+    centres = _prior_centres(found)
 
     def target(y: FloatArray) -> FloatArray:
-        of_priors = np.sum((y[:, :-1] - centres) ** 2, axis=1)
-        return np.asarray(-0.5 / inflation**2 * (squares(y) + of_priors))
+        return np.asarray(-0.5 / inflation**2 * (squares(y) + _prior_squares(centres, y)))
 
     full = surrogate.coordinates(found, inflation)
     coordinates = surrogate.restricted(full, kept)

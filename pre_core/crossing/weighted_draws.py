@@ -45,7 +45,7 @@ def importance_draws(
     start about `start` (f,). All draws are weighted as of the mixture of the surrogates.
     """
     centre = surrogate.transform(coordinates, start)
-    count = convergence.CHAINS * -(-round(_BATCH_SHARE * draws) // convergence.CHAINS)
+    count = batch_size(draws)
     used: list[surrogate.Surrogate] = []
     y, x = np.empty((0, centre.size)), np.empty((0, centre.size))
     log_target = np.empty(0)
@@ -68,6 +68,11 @@ def importance_draws(
         now = surrogate.refine(
             now, coordinates, x, log_target, count, is_weighted=len(used) > _UNWEIGHTED_BATCHES
         )
+
+
+def batch_size(draws: int) -> int:
+    """Return the number of draws weighted together, a multiple of the number of chains."""
+    return convergence.CHAINS * -(-round(_BATCH_SHARE * draws) // convergence.CHAINS)
 
 
 def _in_parts(target: LogDensity, y: FloatArray) -> FloatArray:

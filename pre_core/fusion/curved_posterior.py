@@ -31,6 +31,7 @@ from pre_core.fusion.path_groups import (
 )
 from pre_core.fusion.variability import change_root, marginalise_variability, varying_bridge
 from pre_core.search import tempering
+from pre_core.search.latent import LatentCoordinates
 
 _WIDENED = 3.0
 """Width of the normal from which draws begin, relative to that about the most likely bridge."""
@@ -160,7 +161,7 @@ def curved_draws(
     threads: int = 1,
 ) -> FloatArray:
     """Return draws y (count, b) of the bridge's coordinates; they do not depend on `threads`."""
-    latent = _Latent(np.flatnonzero(~priors.coordinates.is_log), priors.log_odds)
+    latent = LatentCoordinates(np.flatnonzero(~priors.coordinates.is_log), priors.log_odds)
 
     each = -(-count // _SNAPSHOTS)
     with ThreadPoolExecutor(threads) as pool:
@@ -173,30 +174,3 @@ def curved_draws(
             log_posterior, of.mean, of.covariance, each, _SNAPSHOTS, rng, progress
         )
     return latent.values(drawn[:count])
-
-
-class _Latent(NamedTuple):
-    """Normal coordinates v of values y that must not be negative and may be exactly zero.
-
-    Zero is any v below zero; a value that is never zero is that of v and -v.
-    """
-
-    places: NDArray[np.int64]
-    log_odds: FloatArray  # (b,) of zero, against the density per unit
-
-    def values(self, v: FloatArray) -> FloatArray:
-        """Return the values (k, b) of coordinates v (k, b)."""
-        y, some = v.copy(), v[:, self.places]
-        odds = self.log_odds[self.places]
-        y[:, self.places] = np.where(
-            np.isneginf(odds), np.abs(some), np.where(np.isposinf(odds), 0.0, np.maximum(some, 0.0))
-        )
-        return y
-
-    def log_share(self, v: FloatArray) -> FloatArray:
-        """Return the log density (k,) of v (k, b) relative to that of the values."""
-        some, odds = v[:, self.places], self.log_odds[self.places]
-        # Without any chance of another value, v has a density of its own.
-        mass = np.where(np.isfinite(odds), odds + 0.5 * np.log(2.0 / np.pi), 0.0)
-        is_zero = np.isposinf(odds) | ((some <= 0.0) & ~np.isneginf(odds))
-        return np.asarray(np.sum(np.where(is_zero, mass - 0.5 * some**2, 0.0), axis=1))

@@ -1,6 +1,5 @@
 """Diagnostics of draws: of those that were weighted, also where others take their place."""
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,18 +19,15 @@ def test_failed_draws_of_alike_tyres_keep_their_diagnostics(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     worth = SmoothedWeights(np.full(200, 1.0 / 200.0), 1.2, 12.0)
-    nuisances: Any = SimpleNamespace(evaluations=7)
-    monkeypatch.setattr(sampling, "nuisances_at_optimum", lambda *given: nuisances)
-    monkeypatch.setattr(
-        sampling, "draw_curved", lambda *given: WeightedDraws(np.zeros((200, 3)), worth)
-    )
+    weighted = WeightedDraws(np.zeros((200, 3)), worth)
+    monkeypatch.setattr(sampling, "drawn_by_residuals", lambda *given: (weighted, 407))
     monkeypatch.setattr(sampling, "_compliance_draws", lambda *given: DRAWS)
     found: Any = None
     chains = sampling._alike_tyres_draws(found, 1200, 1, 1.0, lambda stage, fraction: None)
     assert chains.draws is DRAWS.draws
     assert chains.ending is Termination.STEPS_EXHAUSTED
     assert (chains.ess, chains.acceptance, chains.pareto_k) == (12.0, 12.0 / 200.0, 1.2)
-    assert chains.evaluations == 7 + 2 * 200
+    assert chains.evaluations == 407
 
 
 @pytest.mark.parametrize("k", [None, np.inf])

@@ -1,0 +1,168 @@
+"""Posterior draws by the residuals themselves, proposed by surfaces of them.
+
+Alike tyres show a bridge so sharply that a surface fitted once is off by more than the posterior's
+width. So draws on a surface (`search.tempering`) are weighted by the residuals there, to which the
+surface is then fitted too, until the weights hardly vary. All draws are weighted as of the mixture
+of the surfaces (adaptive multiple importance sampling: Cornuet, Marin, Mira and Robert 2012).
+"""
+
+from collections.abc import Callable
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import qr
+
+from pre_core.arrays import FloatArray
+from pre_core.crossing.response_surface import (
+    ParabolaSums,
+    added,
+    parabola_terms,
+    parabolas,
+    sums_of,
+)
+from pre_core.crossing.weighted_draws import WeightedDraws, is_enough
+from pre_core.search import importance, tempering
+from pre_core.search.latent import LatentCoordinates
+from pre_core.search.loop import Report
+
+_MAX_ROUNDS = 12
+_TOGETHER = 100
+"""Number of points evaluated together: their residuals take some megabytes."""
+_STEEPEST = 30.0
+"""Largest logarithm of a point's weight in a fit, relative to the first points' largest."""
+_IMPOSSIBLE = 1e6
+"""Residual of a point that is not possible."""
+_LEAST_SIZE = 1e-9
+_START_SPREAD = 2.0
+"""Width of the normal from which draws on a surface begin, relative to the points'."""
+
+
+class DrawnDensity(NamedTuple):
+    """The posterior of a crossing's curved coordinates and offset, by its residuals."""
+
+    residuals: Callable[[FloatArray], FloatArray]
+    """Function from points (k, d) to the residuals (m, k) there."""
+    prior_squares: Callable[[FloatArray], FloatArray]
+    """Function from points (k, d) to the squares (k,) of their priors."""
+    latent: LatentCoordinates
+    inflation: float
+
+
+class _Frame(NamedTuple):
+    """Coordinates u = (y - centre)/size of all fits, and the log density of a point of weight 1."""
+
+    centre: FloatArray  # (d,)
+    size: FloatArray  # (d,)
+    level: float
+
+
+class _Fitted(NamedTuple):
+    """A surface of squares, with mean and covariance of its points."""
+
+    frame: _Frame
+    rows: FloatArray  # (p, p) of few residuals with the same squares
+    mean: FloatArray  # (d,)
+    root: FloatArray  # (d, d) lower triangular root of the covariance
+
+    def squares(self, y: FloatArray) -> FloatArray:
+        """Return sums of squares (k,) at points y (k, d)."""
+        terms = parabola_terms((y - self.frame.centre) / self.frame.size)
+        return np.asarray(np.sum((terms @ self.rows.T) ** 2, axis=1))
+
+
+class _Points(NamedTuple):
+    """Points at which residuals have been evaluated, and what remains of these."""
+
+    y: FloatArray  # (k, d)
+    squares: FloatArray  # (k,)
+    weight: FloatArray  # (k,) in fits
+    sums: ParabolaSums
+
+
+def residual_draws(
+    density: DrawnDensity,
+    first: FloatArray,
+    draws: int,
+    rng: np.random.Generator,
+    report: Report,
+) -> WeightedDraws:
+    """Return weighted draws (k, d), in rounds of as many as the `first` points (n, d).
+
+    They suffice for `draws`, or are all of `_MAX_ROUNDS`.
+    """
+    residuals = _residuals(density, first)
+    level = float(_log_density(density, first, np.sum(residuals**2, axis=0)).max())
+    # A size of zero is that of what the site file excludes.
+    frame = _Frame(first.mean(axis=0), np.maximum(first.std(axis=0), _LEAST_SIZE), level)
+    batches, used = [_evaluated(density, frame, first, residuals)], list[_Fitted]()
+    while True:
+        report("weighting draws of the posterior", 0.5 + 0.04 * len(used))
+        used.append(_fit(frame, batches))
+        new = _draws_on(density, used[-1], first.shape[0], rng)
+        batches.append(_evaluated(density, frame, new, _residuals(density, new)))
+        weighted = _weighted(density, used, batches[1:])
+        if is_enough(weighted.worth, draws) or len(used) == _MAX_ROUNDS:
+            return weighted
+
+
+def _residuals(density: DrawnDensity, y: FloatArray) -> FloatArray:
+    """Return residuals (m, k) at points y (k, d), huge where they are not finite."""
+    parts = range(0, y.shape[0], _TOGETHER)
+    found = [density.residuals(y[i : i + _TOGETHER]) for i in parts]
+    return np.nan_to_num(np.hstack(found), nan=_IMPOSSIBLE, posinf=_IMPOSSIBLE, neginf=_IMPOSSIBLE)
+
+
+def _log_density(density: DrawnDensity, y: FloatArray, squares: FloatArray) -> FloatArray:
+    """Return the log posterior (k,) at points y (k, d) with these squares (k,)."""
+    return -0.5 / density.inflation**2 * (squares + density.prior_squares(y))
+
+
+def _evaluated(
+    density: DrawnDensity, frame: _Frame, y: FloatArray, residuals: FloatArray
+) -> _Points:
+    squares = np.sum(residuals**2, axis=0)
+    higher = (_log_density(density, y, squares) - frame.level) / y.shape[1]
+    weight = np.exp(np.clip(higher, -_STEEPEST, _STEEPEST))
+    sums = sums_of((y - frame.centre) / frame.size, residuals, weight)
+    return _Points(y, squares, weight, sums)
+
+
+def _fit(frame: _Frame, batches: list[_Points]) -> _Fitted:
+    """Return the surface of the residuals at all points, which count by their weights."""
+    rows, _ = parabolas(reduce(added, (one.sums for one in batches)))
+    y = np.concatenate([one.y for one in batches])
+    weight = np.concatenate([one.weight for one in batches])
+    covariance = np.cov(y.T, aweights=weight) + _LEAST_SIZE**2 * np.eye(y.shape[1])
+    (few,) = qr(rows, mode="r")
+    return _Fitted(
+        frame,
+        np.asarray(few[: rows.shape[1]]),
+        np.average(y, axis=0, weights=weight),
+        np.asarray(np.linalg.cholesky(covariance)),
+    )
+
+
+def _draws_on(
+    density: DrawnDensity, fitted: _Fitted, count: int, rng: np.random.Generator
+) -> FloatArray:
+    """Return draws y (count, d) of the posterior with a surface in place of the residuals."""
+    latent = density.latent
+
+    def target(v: FloatArray) -> FloatArray:
+        y = latent.values(v)
+        return _log_density(density, y, fitted.squares(y)) + latent.log_share(v)
+
+    covariance = _START_SPREAD**2 * fitted.root @ fitted.root.T
+    return latent.values(tempering.tempered_draws(target, fitted.mean, covariance, count, 1, rng))
+
+
+def _weighted(density: DrawnDensity, used: list[_Fitted], batches: list[_Points]) -> WeightedDraws:
+    """Return all draws on the surfaces `used`, weighted as of their mixture."""
+    y = np.concatenate([one.y for one in batches])
+    squares = np.concatenate([one.squares for one in batches])
+    half = -0.5 / density.inflation**2
+    of_used = half * np.stack([one.squares(y) for one in used], axis=1)
+    counts = np.array([one.y.shape[0] for one in batches])
+    log_weight = importance.mixture_log_weights(half * squares, of_used, counts)
+    return WeightedDraws(y, importance.pareto_smooth(log_weight))

@@ -1,0 +1,97 @@
+"""Draws by residuals that no parabola follows, against quadrature."""
+
+import numpy as np
+import pytest
+
+from pre_core.arrays import FloatArray
+from pre_core.crossing.residual_draws import DrawnDensity, residual_draws
+from pre_core.crossing.weighted_draws import WeightedDraws, is_enough
+from pre_core.search.latent import LatentCoordinates
+
+COUNT = 400
+NEVER_ZERO = np.full(2, -np.inf)
+
+
+def prior_squares(y: FloatArray) -> FloatArray:
+    return np.asarray(np.sum(y**2, axis=1))
+
+
+def bent(y: FloatArray) -> FloatArray:
+    """Residuals (2, k) of third and higher order, sharp across a bend."""
+    u, v = y.T
+    return np.stack([(v - np.sin(u) - 0.1 * u**3) / 0.15, u - 0.5])
+
+
+def drawn(
+    residuals: object, latent: LatentCoordinates, inflation: float = 1.0, seed: int = 1
+) -> WeightedDraws:
+    density = DrawnDensity(residuals, prior_squares, latent, inflation)  # type: ignore[arg-type]
+    rng = np.random.default_rng(seed)
+    first = np.array([0.3, 0.4]) + rng.standard_normal((COUNT, 2)) * [0.5, 0.4]
+    return residual_draws(density, latent.values(first), 1200, rng, lambda stage, fraction: None)
+
+
+def moments(weighted: WeightedDraws) -> tuple[FloatArray, FloatArray]:
+    mean = weighted.worth.weight @ weighted.y
+    return mean, np.sqrt(weighted.worth.weight @ (weighted.y - mean) ** 2)
+
+
+@pytest.mark.parametrize("inflation", [1.0, 1.5])
+def test_bent_posterior_against_quadrature(inflation: float) -> None:
+    weighted = drawn(bent, LatentCoordinates(np.zeros(0, dtype=np.int64), NEVER_ZERO), inflation)
+    assert is_enough(weighted.worth, 1200)
+    u, v = (np.linspace(-5.0, 5.0, n) for n in (801, 2001))
+    grid = np.stack([one.ravel() for one in np.meshgrid(u, v)], axis=1)
+    squares = np.sum(bent(grid) ** 2, axis=0) + prior_squares(grid)
+    share = np.exp(-0.5 / inflation**2 * (squares - squares.min()))
+    share /= share.sum()
+    true_mean = share @ grid
+    true_spread = np.sqrt(share @ (grid - true_mean) ** 2)
+    mean, spread = moments(weighted)
+    assert mean == pytest.approx(true_mean, abs=0.15 * true_spread.min())
+    assert spread == pytest.approx(true_spread, rel=0.12)
+
+
+def test_value_that_may_be_zero_is_so_by_its_odds() -> None:
+    """P(0)/P(> 0) is the odds over the integral of the density above zero relative to at zero."""
+    odds = 0.4
+    latent = LatentCoordinates(np.array([0]), np.array([odds, -np.inf]))
+
+    def residuals(y: FloatArray) -> FloatArray:
+        return np.stack([2.0 * (y[:, 0] - 0.5) + 0.3 * y[:, 0] ** 3, y[:, 1] - 1.0])
+
+    weighted = drawn(residuals, latent)
+    x = np.linspace(0.0, 5.0, 20001)
+    squares = (2.0 * (x - 0.5) + 0.3 * x**3) ** 2 + x**2
+    above = np.sum(np.exp(-0.5 * (squares - squares[0]))) * (x[1] - x[0])
+    expected = np.exp(odds) / (np.exp(odds) + above)
+    zero = float(weighted.worth.weight @ (weighted.y[:, 0] == 0.0))
+    assert zero == pytest.approx(expected, abs=0.06)
+
+
+def test_draws_return_from_where_a_parabola_is_deeper_than_the_residuals() -> None:
+    """Flat beyond the points, a residual's parabola falls to zero at three times their distance."""
+
+    def residuals(y: FloatArray) -> FloatArray:
+        return np.stack([8.0 + 4.0 * np.tanh(y[:, 0]), 3.0 * (y[:, 1] - 0.4)])
+
+    weighted = drawn(residuals, LatentCoordinates(np.zeros(0, dtype=np.int64), NEVER_ZERO))
+    assert is_enough(weighted.worth, 1200)
+    u = np.linspace(-8.0, 8.0, 4001)
+    squares = (8.0 + 4.0 * np.tanh(u)) ** 2 + u**2
+    share = np.exp(-0.5 * (squares - squares.min()))
+    mean, spread = moments(weighted)
+    true = float(share @ u / share.sum())
+    assert mean[0] == pytest.approx(true, abs=0.1)
+    assert spread[0] == pytest.approx(np.sqrt(share @ (u - true) ** 2 / share.sum()), rel=0.15)
+
+
+def test_points_that_are_not_possible_are_never_drawn() -> None:
+    def residuals(y: FloatArray) -> FloatArray:
+        out = np.stack([y[:, 0], y[:, 1]])
+        out[:, y[:, 0] > 1.0] = np.nan
+        return out
+
+    weighted = drawn(residuals, LatentCoordinates(np.zeros(0, dtype=np.int64), NEVER_ZERO))
+    assert weighted.worth.weight @ (weighted.y[:, 0] > 1.0) < 1e-12
+    assert is_enough(weighted.worth, 1200)
