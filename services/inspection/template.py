@@ -114,16 +114,18 @@ _USUAL: Final = (
 )
 """Keys that are alike in trucks of one kind; masses and lengths have to be measured."""
 _USUAL_SPREAD: Final = 0.3
+_CAUTION: Final = "# measure the truck: spreads of 0.1 narrow intervals most"
 
 
 def template_of(truck: Vehicle) -> str:
     """Return the template with springs, dampers, axles and tyres of a typical truck."""
     lines = []
+    caution = _CAUTION
     for line in TEMPLATE.split("\n"):
         key, _, _ = line.removeprefix("# ").partition(" = ")
         if key in _USUAL:
             line = f"{f'{key} = {list(getattr(truck, key))}':<60}# typical, not measured"
         elif key.removesuffix("_spread") in _USUAL:
-            line = f"{key} = {_USUAL_SPREAD}"
+            line, caution = f"{f'{key} = {_USUAL_SPREAD}':<44}{caution}".rstrip(), ""
         lines.append(line)
     return "\n".join(lines)

@@ -64,9 +64,12 @@ def usual_tandem(noise_ug_per_rthz: float, tyres: str = "twin") -> Vehicle:
 def usual_lorry(tyres: str = "twin") -> Vehicle:
     """Return a lorry of two axles of `LORRY_KG` with `tyres` ("single" or "twin") behind.
 
-    With single tyres both axles are equal and have one track. Four sensors are in the middle.
+    With single tyres both axles have the same tyres and one track. Four sensors are in the middle.
     """
     kinds = (TYRES["single"], TYRES[tyres])
+    front, behind, _ = _TYRES_N_PER_M
+    if tyres == "single":  # twin tyres are two a side, a single axle has the front one's two tyres
+        behind = front
     return Vehicle.model_validate(
         {
             "id": "lorry",
@@ -78,7 +81,7 @@ def usual_lorry(tyres: str = "twin") -> Vehicle:
             "suspension_damping_ns_per_m": (20e3, 34e3),
             "suspension_stiffness_n_per_m": (3.2e5, 8.5e5),
             "unsprung_mass_kg": (700.0, 1_100.0),
-            "tyre_stiffness_n_per_m": (2.0e6, 3.7e6),
+            "tyre_stiffness_n_per_m": (front, behind),
             "tyre_width_m": tuple(kind.width_m for kind in kinds),
             "twin_tyre_distance_m": tuple(kind.twin_distance_m for kind in kinds),
             "track_m": (_TRACKS_M[0], _TRACKS_M[1] if tyres == "twin" else _TRACKS_M[0]),
