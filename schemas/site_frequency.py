@@ -65,6 +65,8 @@ def _given(table: dict[str, Any]) -> ImpliedQuantity:
     if ratio > 1.0:
         meant += f" with bearings free to turn, {rigidity * of_clamped:.3g} with clamped ends"
     meant += ", or another mass_per_length_kg_per_m"
+    if per_span:
+        meant += f", or span_m is {bridge.span_m:g}: {bridge.span_m / ratio**0.25:.3g}"
     low, high = _GIVEN_OVER_IMPLIED
     most = (_ABOVE_CLAMPED * clamped_hz / free_hz) ** 2
     return ImpliedQuantity(
