@@ -64,15 +64,20 @@ def _given(table: dict[str, Any]) -> ImpliedQuantity:
     )
     if ratio > 1.0:
         meant += f" with bearings free to turn, {rigidity * of_clamped:.3g} with clamped ends"
-    meant += ", or another mass_per_length_kg_per_m"
-    if per_span:
-        meant += f", or span_m is {bridge.span_m:g}: {bridge.span_m / ratio**0.25:.3g}"
+    meant += f", or another mass_per_length_kg_per_m, or {_other_span(bridge, ratio)}"
     low, high = _GIVEN_OVER_IMPLIED
     most = (_ABOVE_CLAMPED * clamped_hz / free_hz) ** 2
     return ImpliedQuantity(
         "given_frequency", text, ratio, low, high, "of EI by this frequency over the nominal one",
         meant, wrong_beyond=(_LEAST_EI, most),
     )  # fmt: skip
+
+
+def _other_span(bridge: Bridge, ratio: float) -> str:
+    """Return the span that has the given frequency, at the nominal EI; spans in words."""
+    if bridge.interior_supports_m:
+        return "other spans (span_m, interior_supports_m)"
+    return f"a span_m of {bridge.span_m / ratio**0.25:.3g}"
 
 
 @lru_cache(maxsize=4 * MAX_BRIDGES)

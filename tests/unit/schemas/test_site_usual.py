@@ -194,6 +194,7 @@ def test_rigidity_that_contradicts_the_first_frequency_is_named(
     (line,) = lines
     assert "flexural_rigidity_nm2" in line
     assert "1.56e+10 for 3.29 Hz" in line
+    assert line.endswith(f", or a span_m of {30.0 * factor**0.25:.3g}")  # frequency by 1/span²
 
 
 @pytest.mark.parametrize(
@@ -226,6 +227,7 @@ def test_first_frequency_of_two_spans_is_compared_with_ei(given_hz: float, state
     assert f"flexural_rigidity_nm2 is 7.5e+09: {fitting:.3g} for {given_hz:g} Hz" in found.advice
     clamped = f"{fitting / 2.441:.3g} with clamped ends"
     assert (clamped in found.advice) == (given_hz > 7.32)
+    assert found.advice.endswith(", or other spans (span_m, interior_supports_m)")
     assert bool(warnings_of(parse_site(text, "site.toml"), text)) == (state != "ok")
 
 
