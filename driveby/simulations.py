@@ -13,6 +13,7 @@ from services.cli.parsing import Parser
 from services.common.errors import InputError
 from services.common.options import option_of
 from services.execution.blas import one_blas_thread
+from services.notebook.arguments import naming_force
 from services.notebook.read import Name
 
 _NOT_OF_NOTEBOOKS: Final = {"output", "verbose", "log_format", "debug"}
@@ -40,7 +41,7 @@ def simulate_recording(output: Name, site: Name | Site | None = None, **options:
         known = options_by_key(command).keys() - _NOT_OF_NOTEBOOKS
         given = _arguments(options, sorted(known))
         parsed = parser.parse_args(["simulate", *given, f"--output={output}"])
-        with one_blas_thread():
+        with one_blas_thread(), naming_force():
             parsed.handler(parsed)
     return Path(output)
 

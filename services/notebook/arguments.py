@@ -1,7 +1,8 @@
 """Checks of arguments: a wrong one is an InputError of one line that names it."""
 
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import wraps
 from operator import index
 from os import PathLike
@@ -45,6 +46,15 @@ def known_arguments(
         return checked
 
     return decorated
+
+
+@contextmanager
+def naming_force() -> Iterator[None]:
+    """Name the argument `force` in errors of code that the command line shares, not its option."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(str(error).replace("--force", "force=True")) from None
 
 
 def number(name: str, value: object, low: float, high: float) -> float:

@@ -18,6 +18,7 @@ from services.finding.placed import middle_site
 from services.notebook.arguments import (
     file_of,
     known_arguments,
+    naming_force,
     number,
     numbers,
     one_or_two,
@@ -104,7 +105,8 @@ class Simulation(NamedTuple):
         Raise InputError if there is a recording, which only `force` replaces, or if it cannot be
         written.
         """
-        write_drive(file_of(path), self.drive, self.site, force=force)
+        with naming_force():
+            write_drive(file_of(path), self.drive, self.site, force=force)
 
 
 @known_arguments(

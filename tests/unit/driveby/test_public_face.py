@@ -454,7 +454,7 @@ def test_simulate_is_the_command(tmp_path: Path) -> None:
     simulation.write(mine)
     assert mine.read_bytes() == theirs.read_bytes()
     assert simulation.ei_ratios.tolist() == ratios
-    with pytest.raises(driveby.InputError, match="is a recording, and none is replaced"):
+    with pytest.raises(driveby.InputError, match=r"none is replaced without force=True;"):
         simulation.write(mine)
     simulation.write(mine, force=True)
     assert mine.read_bytes() == theirs.read_bytes()
