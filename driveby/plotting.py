@@ -13,7 +13,7 @@ from services.viewer.bridge_figure import draw_bridge
 from services.viewer.bridge_view import view_of_bridge
 from services.viewer.crossing_view import view_of_crossing
 from services.viewer.drawing import STYLE
-from services.viewer.figure import draw_crossing
+from services.viewer.figure import draw_crossing, true_road_as_measured
 
 
 def plot(
@@ -23,6 +23,9 @@ def plot(
     bridge: str | None = None,
 ) -> Figure:
     """Draw one crossing, with the truth next to it where it is known, or one fused bridge.
+
+    The true road is drawn on the bridge, less the least-squares parabola of its distance from the
+    estimate: twice integrated accelerations determine neither level, slope nor bend.
 
     An `Identification` of several crossings is refused with InputError: draw its `solutions` one by
     one. `bridge` selects one of several that are fused. Jupyter shows the figure after
@@ -38,11 +41,15 @@ def plot(
     if not isinstance(found, Solution | Identification):
         raise wrong("found", found, "what identify() or fuse() returns, or one of its solutions")
     one = one_solution("found", found, "plot")
+    road = one.crossing.road
+    true_road = None if truth is None else truth.road_m
+    if true_road is not None and road is not None:
+        true_road = true_road_as_measured(road, true_road)
     with matplotlib.rc_context(STYLE):
         return draw_crossing(
             view_of_crossing(one.crossing, one.bridge),
             element_truth=None if truth is None else truth.ei_ratios.tolist(),
-            road_truth=None if truth is None else truth.road_m,
+            road_truth=true_road,
         )
 
 

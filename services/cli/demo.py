@@ -19,8 +19,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-import numpy as np
-
 from pre_core.paper import experiment
 from schemas.messages import decode
 from schemas.proto import driveby_pb2 as pb
@@ -31,7 +29,6 @@ from schemas.site_file import site_toml
 from services.bus.playback import set_by_signals
 from services.bus.session import open_session
 from services.bus.subscription import RawSample, Subscription
-from services.common.arrays import Floats
 from services.common.errors import FailureError, InputError
 from services.common.files import write_atomically
 from services.common.interrupts import handled_by
@@ -333,7 +330,7 @@ def _check_recording(path: Path, sent: int) -> None:
 def _draw(folder: Path, crossing: CrossingResult, drive: SimulatedDrive, site: Site) -> None:
     from services.viewer.bridge_view import views_of_bridges
     from services.viewer.crossing_view import view_of_crossing
-    from services.viewer.figure import crossing_figure
+    from services.viewer.figure import crossing_figure, true_road_as_measured
     from services.viewer.rerun_file import RerunContent, write_rrd
     from services.viewer.residuals import residual_cells
     from services.viewer.vehicle_signals import signals_of_messages
@@ -350,21 +347,8 @@ def _draw(folder: Path, crossing: CrossingResult, drive: SimulatedDrive, site: S
         folder / _FIGURE,
         crossing=view_of_crossing(crossing, site.bridge(crossing.bridge)),
         element_truth=drive.rigidity_ratios.tolist(),
-        road_truth=_true_road(crossing, drive),
+        road_truth=true_road_as_measured(crossing.road, drive.road) if crossing.road else None,
     )
-
-
-def _true_road(crossing: CrossingResult, drive: SimulatedDrive) -> tuple[Floats, Floats] | None:
-    """Return the road under the wheels, with level, slope and curvature of the estimate.
-
-    Integrated accelerations do not show these three; the rest can be compared.
-    """
-    if crossing.road is None:
-        return None
-    x = np.array(crossing.road.x_m)
-    height = np.interp(x, drive.road.x_m, drive.road.height_m)
-    apart = height - np.array(crossing.road.mean_m)
-    return x, height - np.polynomial.Polynomial.fit(x, apart, 2)(x)
 
 
 def _print(console: "Console", crossing: CrossingResult, drive: SimulatedDrive, site: Site) -> None:

@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from schemas.reasons import Reason
+from schemas.results import RoadResult
 from services.common.arrays import Floats
 from services.common.language import ENGLISH
 from services.identification.result_parts import detrended
@@ -71,6 +72,17 @@ def crossing_figure(
     with matplotlib.rc_context(STYLE):
         figure = draw_crossing(crossing, element_truth=element_truth, road_truth=road_truth)
     write_figure(path, figure)
+
+
+def true_road_as_measured(road: RoadResult, truth: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+    """Return chainage and height (m,) of a true road with level, slope and bend of the estimate.
+
+    Twice integrated accelerations determine none of the three; the rest can be compared.
+    """
+    x_m = np.array(road.x_m)
+    height_m = np.interp(x_m, *truth)
+    apart = height_m - np.array(road.mean_m)
+    return x_m, height_m - np.polynomial.Polynomial.fit(x_m, apart, 2)(x_m)
 
 
 def draw_crossing(

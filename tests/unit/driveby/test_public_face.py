@@ -554,6 +554,14 @@ def test_plot_draws_estimate_and_truth(
             ),
         )
     ]
+    road = exact.solutions[0].crossing.road
+    assert road is not None
+    panel = driveby.plot(
+        exact, truth=simulation._replace(drive=simulation.drive._replace(road=tilted))
+    )
+    (true_mm,) = (one.get_ydata() for one in panel.axes[1].lines if one.get_label() == "truth")
+    apart_mm = np.asarray(true_mm) - 1e3 * np.array(road.mean_m)
+    assert abs(np.polynomial.Polynomial.fit(road.x_m, apart_mm, 2).coef).max() < 1e-9
     assert np.nanmax(np.abs(errors[0] - errors[1])) < 1e-6 * np.nanmax(np.abs(errors[0]))
     assert (
         "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()
