@@ -41,6 +41,7 @@ from services.simulation.drive import (
     write_drive,
 )
 from services.simulation.lane import twist_of
+from services.simulation.recorded_road import SURVEY_ROAD_M
 from services.simulation.schedule import begun_at, schedule_of
 
 _REALM: Final = "sim-drive"
@@ -161,6 +162,7 @@ def simulate(
                 density,
                 rate_hz=None if rate is None else number("rate", rate, 50, 50_000),
                 has_receiver_errors=gps_noise,
+                least_road_m=(0.0, 0.0) if site is None else SURVEY_ROAD_M,
             ),
             speed_m_per_s=speeds,
             forward=direction == "start_to_end",

@@ -31,6 +31,7 @@ from services.simulation.drive_tandem import TandemDrive, simulate_tandem
 from services.simulation.lane import driven_lane, twist_of
 from services.simulation.pair import with_pair_first
 from services.simulation.pavement import Pavement
+from services.simulation.recorded_road import SURVEY_ROAD_M
 from services.simulation.schedule import Schedule, schedule_of
 from services.simulation.settings import SimulateOptions
 from services.simulation.usual_trucks import usual_tandem
@@ -88,6 +89,7 @@ def _simulate_plane(
                     rate_hz=asked.rate,
                     has_receiver_errors=asked.gps_noise,
                     seed=(of_noise, number) if number else of_noise,
+                    least_road_m=(0.0, 0.0) if asked.site is None else SURVEY_ROAD_M,
                 ),
                 speed_m_per_s=asked.speed,
                 forward=asked.direction == "start_to_end",
@@ -174,5 +176,7 @@ def _simulate_tandem(asked: SimulateOptions, site: Site, console: "Console") -> 
         schedule_of(asked.runs, asked.days, asked.start),
         asked.seed if asked.drive_seed is None else asked.drive_seed,
     )
+    if asked.site is not None:
+        how = how._replace(least_before_m=SURVEY_ROAD_M[0])
     ratios = ratios_of(site.bridges[0], asked.scenario, asked.ei)
     return simulate_tandem(site, ratios, how, asked.output, force=asked.force, console=console)

@@ -50,6 +50,7 @@ from services.simulation.positions import (
     gnss_track,
     receiver_of,
 )
+from services.simulation.recorded_road import times_s
 from services.simulation.schedule import Schedule, begun_at
 from services.simulation.wheel_paths import (
     AxleRoads,
@@ -64,7 +65,6 @@ LONGEST_STEP_S = 1e-4
 """Longest time step: the truth must be far more exact than the tested method."""
 SETTLE_S = 3.0
 """Duration of the drive before its recording: it starts at rest on a rough road."""
-_BEFORE_S, _AFTER_S = 3.0, 2.5
 _ROAD_SPACING_M = 0.01
 _CONTACT_PATCH_M = 0.2
 TRUCK_KEYS: Final = tuple(
@@ -124,6 +124,8 @@ class Measurement(NamedTuple):
     """Whether the receiver has the errors of the site file, or none."""
     seed: int | tuple[int, ...] | None = None
     """Seed of noise and of the truck's lateral position; None: that of the road."""
+    least_road_m: tuple[float, float] = (0.0, 0.0)
+    """Least recorded road of the rear axle before and after the bridge."""
 
 
 NO_ERRORS = Measurement()
@@ -215,9 +217,9 @@ def simulate_drive(
 ) -> SimulatedDrive:
     """Drive the site's first truck over its first bridge.
 
-    The speed changes evenly from the first to the second value between 3 s before the entry and the
-    end. A twist in `beyond` gives the offset of the lane. Raise FailureError if the coupled
-    simulation does not converge.
+    The speed changes evenly from the first to the second value over the recording. A twist in
+    `beyond` gives the offset of the lane. Raise FailureError if the coupled simulation does not
+    converge.
     """
     vehicle, bridge = site.vehicles[0], site.bridges[0]
     car, beam = with_effects(truck_of(vehicle), beam_of(bridge, rigidity_ratios), beyond)
@@ -227,14 +229,16 @@ def simulate_drive(
     every = max(1, round(1.0 / (rate * LONGEST_STEP_S)))
     step_s = 1.0 / (rate * every)
     begin, end = speed_m_per_s
-    mean = 0.5 * (begin + end)
-    driven_s = _BEFORE_S + (bridge.span_m + vehicle.wheelbase_m) / mean + _AFTER_S
+    on_bridge_m = bridge.span_m + vehicle.wheelbase_m
+    before_s, driven_s = times_s(
+        speed_m_per_s, on_bridge_m, vehicle.wheelbase_m, measurement.least_road_m
+    )
     acceleration = (end - begin) / driven_s
     settle = round(SETTLE_S * rate) * every
     steps = settle + int(np.ceil(driven_s * rate)) * every + 1
-    # When the recording begins the truck has its first speed and is 3 s from the bridge.
+    # When the recording begins the truck has its first speed.
     first_speed = begin - acceleration * SETTLE_S
-    approach = begin * _BEFORE_S + 0.5 * acceleration * _BEFORE_S**2
+    approach = begin * before_s + 0.5 * acceleration * before_s**2
     approach += first_speed * SETTLE_S + 0.5 * acceleration * SETTLE_S**2
     sign = 1 if forward else -1
     start = -approach if forward else bridge.span_m + approach

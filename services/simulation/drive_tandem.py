@@ -60,6 +60,8 @@ class TandemDrive(NamedTuple):
     """Surface on which every tyre has a path of its own; None: one profile for all."""
     schedule: Schedule = ONCE
     drive_seed: int = 1
+    least_before_m: float = 0.0
+    """Least recorded road of the last axle before the bridge."""
 
 
 def simulate_tandem(
@@ -156,6 +158,7 @@ def tandem_case(site: Site, ratios: Floats, how: TandemDrive) -> WideCase:
         else SatelliteErrors(0.0, 0.0, 0.0),
         vehicle.gps_antenna_to_front_axle_m,
         of_receiver.latency_s,
+        how.least_before_m,
     )
 
 

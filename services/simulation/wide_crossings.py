@@ -109,6 +109,8 @@ class WideCase(NamedTuple):
     """Distance of the receiver's antenna behind the first axle."""
     latency_s: float = 0.0
     """Latency of the receiver's time stamps."""
+    least_before_m: float = 0.0
+    """Least recorded road of the last axle before the bridge."""
 
 
 class WideDrivenRun(NamedTuple):
@@ -128,10 +130,11 @@ def drive_case(case: WideCase, number: int) -> WideDrivenRun:
     how = case.runs[number]
     truck, span = case.truck, case.deck.span_m
     length = max(axle.position_m for axle in truck.axles)
+    before_m = max(_BEFORE_M, case.least_before_m + length if case.least_before_m else 0.0)
     step_s = 1.0 / (case.rate_hz * np.ceil(1.0 / (case.rate_hz * LONGEST_STEP_S)))
     slowest = how.speed_m_per_s - abs(how.change_m_per_s)
-    reach = (how.speed_m_per_s + abs(how.change_m_per_s)) * _RUN_UP_S + _BEFORE_M
-    duration = _RUN_UP_S + (_BEFORE_M + span + length + _BEHIND_M) / slowest
+    reach = (how.speed_m_per_s + abs(how.change_m_per_s)) * _RUN_UP_S + before_m
+    duration = _RUN_UP_S + (before_m + span + length + _BEHIND_M) / slowest
     motion = even_motion(
         -reach if how.forward else span + reach,
         how.speed_m_per_s,
@@ -156,7 +159,7 @@ def drive_case(case: WideCase, number: int) -> WideDrivenRun:
     response = cross(truck, case.deck, road, motion, lane_offset_m=lane, settle_s=_SETTLE_S)
     rng = np.random.default_rng(np.random.SeedSequence([case.seed, 0x51DE, number]))
     travel = sign * (response.position_m - (0.0 if how.forward else span))
-    begin = float(np.interp(-_BEFORE_M, travel, response.time_s))
+    begin = float(np.interp(-before_m, travel, response.time_s))
     end = float(np.interp(span + length + _BEHIND_M, travel, response.time_s))
     time_s = begin + np.arange(int((end - begin) * case.rate_hz)) / case.rate_hz
     start_s = START_TIME_S + number * BETWEEN_RUNS_S
