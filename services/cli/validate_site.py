@@ -22,17 +22,26 @@ from services.common.naming import count_of, processes_in_words
 from services.common.progress import progress_bar, start_line
 from services.history.validation_files import save
 from services.simulation.validation_options import CertificateOptions
-from services.simulation.validation_trial import CROSSINGS, ValidationTrial, run_trial
+from services.simulation.validation_trial import (
+    CROSSINGS,
+    ValidationTrial,
+    conditions_of,
+    run_trial,
+    single_pair_site,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 
 _AFTER_FAILURE: Final = (
-    "do not rely on intervals of a pair that failed: check the site file, try fewer elements or "
-    "another truck, and validate again"
+    "do not rely on intervals of a pair that failed: check the site file, try fewer elements or a "
+    "truck with equal single tyres or an equalised tandem, and validate again"
 )
 
+_SURFACE: Final = (
+    "axles follow different paths; computing 2-D road surfaces, so the first crossing takes minutes"
+)
 _UNLIKE_PATHS: Final = ("twin_tyre_distance_m", "rear_axle_offset_m")
 """Keys of a vehicle whose axles do not follow the same path."""
 
@@ -62,6 +71,8 @@ def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
     ):
         task = bar.add_task("simulated crossings", total=len(pairs))
         for done, pair in enumerate(pairs):
+            if _has_surface(known, pair):
+                start_line(console, f"{pair}: {_SURFACE}")
             trial = ValidationTrial(known, pair, settings, asked.seed)
             for share in run_trial(trial, pool, asked.processes):
                 bar.update(task, completed=done + share)
@@ -72,6 +83,12 @@ def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
     if not have_passed:
         console.print(_AFTER_FAILURE, highlight=False, soft_wrap=True)
     return 0 if have_passed else 1
+
+
+def _has_surface(known: Site, pair: VehicleBridgePair) -> bool:
+    """Return whether the crossings of a pair are simulated on a 2-D surface of the road."""
+    alone = single_pair_site(known, pair)
+    return conditions_of(alone.vehicles[0], alone.bridges[0], alone).road == "surface"
 
 
 def _pairs(known: Site, asked: CertificateOptions) -> list[VehicleBridgePair]:

@@ -69,6 +69,7 @@ _STEADY_M_PER_S2: Final = 0.1
 _SEEDS: Final = 1000
 """Distance of the crossings' seeds between two seeds of trials."""
 _ALL_SEEDS: Final = 1 << 63
+_SHOWN_EVERY_S: Final = 10.0
 
 
 class TrialOutcome(NamedTuple):
@@ -165,13 +166,13 @@ class ValidationTrial:
 def run_trial(trial: ValidationTrial, pool: ProcessPoolExecutor, processes: int) -> Iterator[float]:
     """Run a trial to its judgement, `processes` crossings at a time; yield the completed share.
 
-    Raise FailureError if a process died.
+    It is also yielded every `_SHOWN_EVERY_S`, as a crossing may take minutes. Raise FailureError if a process died.
     """
     under_way: dict[Future[ValidationCrossing], int] = {}
     while trial.judgement is None:
         while len(under_way) < processes and (one := trial.next_run()) is not None:
             under_way[pool.submit(one.run)] = one.number
-        for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+        for future in wait(under_way, _SHOWN_EVERY_S, FIRST_COMPLETED).done:
             number = under_way.pop(future)
             try:
                 trial.add(number, future.result())

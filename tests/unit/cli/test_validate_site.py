@@ -59,7 +59,10 @@ def test_every_pair_gets_a_line_and_a_file(
     folder = tmp_path / "made" / "here"
     assert validate("--site", site, "--validations", folder, "--seed", 4) == 1
     *lines, advice = capsys.readouterr().out.splitlines()
-    assert "check the site file, try fewer elements or another truck" in advice
+    assert (
+        "check the site file, try fewer elements or a truck with equal single tyres or an equalised tandem"
+        in advice
+    )
     assert [line.split(":")[0] for line in lines] == [
         "truck-1 on bridge-1",
         "truck-1 on bridge-2",
@@ -127,6 +130,17 @@ def test_validation_announces_pairs_and_processes(
     assert line.endswith(
         "validating 4 pairs of truck and bridge: at most 12 simulated crossings each, on 1 process"
     )
+
+
+def test_validation_announces_surfaces(
+    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paper = paper_site()
+    unlike = paper.vehicles[0].model_copy(update={"twin_tyre_distance_m": (0.0, 0.33)})
+    site.write_text(site_toml(paper.model_copy(update={"vehicles": (unlike,)})))
+    assert validate("--site", site, "--validations", tmp_path / "certificates") == 0
+    _, line = capsys.readouterr().err.splitlines()
+    assert "truck-1 on bridge-1: axles follow different paths; computing 2-D road surfaces" in line
 
 
 def test_one_pair_may_be_asked_for(

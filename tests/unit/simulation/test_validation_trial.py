@@ -1,6 +1,7 @@
 """The crossings of a certificate and the rule that judges them."""
 
 from concurrent.futures import BrokenExecutor, Future
+from threading import Timer
 from typing import Any
 
 import numpy as np
@@ -203,6 +204,24 @@ def test_any_number_of_processes_gives_the_same_certificate(processes: int) -> N
     assert shares == sorted(shares)
     assert FEWEST <= pool.submitted < FEWEST + processes
     assert len(trial.certificate(0.0).crossings) == FEWEST
+
+
+class _SlowPool(_Pool):
+    """Whose crossings take time."""
+
+    def submit(self, run: Any) -> Future[ValidationCrossing]:
+        done: Future[ValidationCrossing] = Future()
+        result = super().submit(run).result()
+        Timer(0.05, done.set_result, (result,)).start()
+        return done
+
+
+def test_progress_continues_during_a_crossing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.simulation.validation_trial._SHOWN_EVERY_S", 0.01)
+    pool: Any = _SlowPool()
+    shares = list(run_trial(ValidationTrial(SITE, PAIR, SETTINGS), pool, 1))
+    assert shares[0] == 0.0
+    assert shares[-1] == 1.0
 
 
 class _BrokenPool(_Pool):
