@@ -18,9 +18,11 @@ from schemas.validation_records import (
 from services.common.child_process import end_with_parent
 from services.common.errors import InputError
 from services.common.files import check_writable, make_folder
+from services.common.language import ENGLISH
 from services.common.naming import count_of, processes_in_words
 from services.common.progress import progress_bar, start_line
 from services.history.validation_files import save
+from services.identification.footprints import truck_to_try
 from services.simulation.validation_options import CertificateOptions
 from services.simulation.validation_trial import (
     CROSSINGS,
@@ -35,8 +37,8 @@ if TYPE_CHECKING:
 
 
 _AFTER_FAILURE: Final = (
-    "do not rely on intervals of a pair that failed: check the site file, try fewer elements or a "
-    "truck with equal single tyres or an equalised tandem, and validate again"
+    "do not rely on intervals of a pair that failed: check the site file, try {remedy}, and "
+    "validate again"
 )
 
 _SURFACE: Final = (
@@ -63,7 +65,7 @@ def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
         f"validating {trials} of truck and bridge: at most {CROSSINGS} simulated crossings each, "
         f"on {processes_in_words(asked.processes)}",
     )
-    have_passed = True
+    failed = set()
     # A fork is impossible: the threads of numba and OpenBLAS would not survive it.
     with (
         progress_bar(console) as bar,
@@ -78,11 +80,14 @@ def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
                 bar.update(task, completed=done + share)
             certificate = trial.certificate(time.time())
             path = save(asked.validations, certificate)
-            have_passed &= certificate.passed
+            if not certificate.passed:
+                failed.add(truck_to_try(known.vehicle(pair.vehicle)))
             console.print(line_of(certificate, path, known), highlight=False, soft_wrap=True)
-    if not have_passed:
-        console.print(_AFTER_FAILURE, highlight=False, soft_wrap=True)
-    return 0 if have_passed else 1
+    if failed:
+        kind = next(one for one in ("unlike", "single", "tandem") if one in failed)
+        remedy = ENGLISH.text(f"caution.try.{kind}")
+        console.print(_AFTER_FAILURE.format(remedy=remedy), highlight=False, soft_wrap=True)
+    return int(bool(failed))
 
 
 def _has_surface(known: Site, pair: VehicleBridgePair) -> bool:

@@ -20,6 +20,7 @@ from schemas.validation_records import (
 from services.common.errors import InputError
 from services.common.files import make_folder, write_atomically
 from services.common.language import ENGLISH, Language
+from services.identification.footprints import truck_to_try
 
 _log = logging.getLogger(__name__)
 
@@ -96,6 +97,7 @@ def validation_notes(
                 covered=figures.covered,
                 intervals=figures.intervals,
                 least=100.0 * LEAST_COVERAGE,
+                remedy=language.text(f"caution.try.{truck_to_try(site.vehicle(pair.vehicle))}"),
             )
     if untried:
         yield language.text("caution.unvalidated", trucks=language.listed(untried))

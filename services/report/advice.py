@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from schemas.results import CrossingResult
 from services.common.language import Language, utc_day
+from services.identification.footprints import truck_to_try
 from services.report.bridge import BridgeReport, still_weak
 from services.report.cautions import named_elements, possibly_weak, weak_before
 from services.report.place import position_of
@@ -39,7 +40,7 @@ def next_steps(report: BridgeReport, language: Language) -> Iterator[str]:
             yield from _implausible(report, language)
             if report.view.comparison is not None:
                 yield language.text("advice.open")
-                yield language.text("advice.open_truck")
+                yield from _other_truck(report, language)
         case kind:
             yield language.text("advice.rejected" if kind == "nothing" else "advice.suspect")
             yield from advice_of_state(report, language)
@@ -52,6 +53,14 @@ def next_steps(report: BridgeReport, language: Language) -> Iterator[str]:
         yield language.text("advice.next_survey")
     elif comparison is None or not comparison.implausible:
         yield language.text("advice.keep")
+
+
+def _other_truck(report: BridgeReport, language: Language) -> Iterator[str]:
+    """Yield which truck would help; only trucks of unlike tyres improve by other tyres."""
+    known = {one.id: one for one in report.site.vehicles}
+    kinds = {truck_to_try(known[one.vehicle]) for one in report.used if one.vehicle in known}
+    best = next((kind for kind in ("tandem", "single") if kind in kinds), "truck")
+    yield language.text(f"advice.open_{best}")
 
 
 def advice(crossings: Iterable[CrossingResult], language: Language) -> list[str]:

@@ -166,7 +166,8 @@ class ValidationTrial:
 def run_trial(trial: ValidationTrial, pool: ProcessPoolExecutor, processes: int) -> Iterator[float]:
     """Run a trial to its judgement, `processes` crossings at a time; yield the completed share.
 
-    It is also yielded every `_SHOWN_EVERY_S`, as a crossing may take minutes. Raise FailureError if a process died.
+    It is also yielded every `_SHOWN_EVERY_S`, as a crossing may take minutes. Raise FailureError if
+    a process died.
     """
     under_way: dict[Future[ValidationCrossing], int] = {}
     while trial.judgement is None:

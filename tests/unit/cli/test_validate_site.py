@@ -59,10 +59,7 @@ def test_every_pair_gets_a_line_and_a_file(
     folder = tmp_path / "made" / "here"
     assert validate("--site", site, "--validations", folder, "--seed", 4) == 1
     *lines, advice = capsys.readouterr().out.splitlines()
-    assert (
-        "check the site file, try fewer elements or a truck with equal single tyres or an equalised tandem"
-        in advice
-    )
+    assert "fewer elements or a truck with equal single tyres or an equalised tandem, and" in advice
     assert [line.split(":")[0] for line in lines] == [
         "truck-1 on bridge-1",
         "truck-1 on bridge-2",

@@ -50,7 +50,8 @@ def test_record_of_the_pair_decides(site: Site, tmp_path: Path) -> None:
     assert line == (
         "Site validation of truck-1 on this bridge FAILED: 12 of 12 simulated crossings were good, "
         "49 of 60 intervals contained the truth (at least 85 % must). Do not rely on the "
-        "intervals: check the site file, try fewer elements or another truck, and validate again."
+        "intervals: check the site file, try fewer elements or a truck with equal single tyres or "
+        "an equalised tandem, and validate again."
     )
     (german,) = validation_notes(tmp_path, site, [PAIR], language_of("de"))
     assert "NICHT bestanden: 12 von 12 simulierten Überfahrten" in german

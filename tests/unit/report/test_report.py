@@ -218,6 +218,10 @@ def test_every_finding_has_a_next_step(site: Site) -> None:
         assert list(next_steps(report, ENGLISH)), kind
     twins = reported(site, kinds["open"]).text
     assert "use a truck with equal single tyres on all axles or with an equalised tandem" in twins
+    truck = site.vehicles[0].model_copy(update={"twin_tyre_distance_m": (0.0, 0.0)})
+    single = reported(site.model_copy(update={"vehicles": (truck,)}), kinds["open"]).text
+    assert "use a truck with equal single tyres" not in single
+    assert "more crossings, fewer elements in the site file, or a truck with an equal" in single
 
 
 def test_a_suspect_result_is_doubtful_and_says_why(site: Site) -> None:
