@@ -256,9 +256,11 @@ class BridgeResult(BaseModel):
     """Derived from `reasons` if not given."""
     finding: str | None = None
     weakest_element: str | None = None
-    """Name of the element with the smallest EI relative to the baseline or nominal."""
+    """Name of the element with the smallest EI relative to the baseline or nominal; None if none is
+    resolved."""
     probability_of_loss: dict[str, dict[str, Finite]] | None = None
-    """Probability of a loss of EI above each percentage, by element; None without a baseline."""
+    """Probability of a loss of EI above each percentage, by element that is resolved now and in the
+    baseline; None without a baseline."""
     level: ElementState | None = None
     """Overall stiffness: length-weighted geometric mean of EI over nominal."""
     thirds: ThirdsState | None = None

@@ -168,7 +168,8 @@ def print_elements(
                 row.append(f"{p.q025 / unit:.{digits}f} … {p.q975 / unit:.{digits}f}")
         if losses:
             of = losses.get(f"EI_{number}", {})
-            row.append("/".join(f"{100.0 * of[p]:.0f}" for p in percents if p in of) + " %")
+            stated = "/".join(f"{100.0 * of[p]:.0f}" for p in percents if p in of)
+            row.append(f"{stated} %" if stated else "not resolved")
         table.add_row(*row)
         start += length
     console.print(table)

@@ -30,6 +30,7 @@ from services.identification.comparison import (
     describe_clear_elements,
     describe_comparison,
     describe_weak_before,
+    doubts_of_baseline,
     estimate_of_state,
     unresolved_elements,
     weak_before,
@@ -72,9 +73,11 @@ def against(result: CrossingResult, baseline: BridgeResult | None) -> CrossingRe
         return result
     stored = baseline.elements
     below = {
-        name: _probability_below(_SOUND, result.parameters[name], of)
+        name: _probability_below(_SOUND, now, of)
         for name, of in stored.items()
-        if name in result.parameters and of.mean > 0.0 and result.parameters[name].mean > 0.0
+        if (now := result.parameters.get(name)) is not None
+        and now.mean > 0.0 < of.mean
+        and not unresolved_elements((now, of))
     }
     derived = result.derived.model_copy(
         update={"probability_below_90_percent_of_baseline": below or None}
@@ -129,8 +132,7 @@ def state_of(
     between = _summary(found.between)
     baseline = fusing.baselines.get(bridge)
     elements = {f"EI_{n}": _summary(ei) for n, ei in enumerate(found.ei_nm2.T, start=1)}
-    ratio = found.ei_nm2 / _reference(found, baseline)
-    weakest = int(np.argmin(np.median(ratio, axis=0))) + 1
+    weakest, losses = _of_resolved(found, elements, baseline)
     state = BridgeResult(
         **elements,  # type: ignore[arg-type]
         between_crossing_std=between.mean,
@@ -138,8 +140,8 @@ def state_of(
         between_crossing_std_q975=between.q975,
         verdict="suspect" if reasons else "good",
         reasons=reasons,
-        weakest_element=f"EI_{weakest}",
-        probability_of_loss=None if baseline is None else _losses(ratio),
+        weakest_element=weakest,
+        probability_of_loss=losses,
         level=_level(found, 0.0, 1.0),
         thirds=_thirds(found),
         tracks=found.tracks,
@@ -255,12 +257,27 @@ def _reference(found: FusedBridge, baseline: BridgeResult | None) -> Floats:
     return np.asarray(of.mean * np.exp(spread * rng.standard_normal(found.ei_nm2.shape)))
 
 
-def _losses(ratio: Floats) -> dict[str, dict[str, float]]:
+def _of_resolved(
+    found: FusedBridge, elements: Mapping[str, ElementState], baseline: BridgeResult | None
+) -> tuple[str | None, dict[str, dict[str, float]] | None]:
+    """Return the weakest element, and probabilities of loss if there is a baseline.
+
+    Only of elements that both the measurement and its baseline resolve.
+    """
+    vague = unresolved_elements(elements.values())
+    if baseline is not None:
+        vague |= unresolved_elements(baseline.elements.values())
+    ratio = found.ei_nm2 / _reference(found, baseline)
+    resolved = {f"EI_{n}": one for n, one in enumerate(ratio.T, start=1) if n not in vague}
+    weakest = min(resolved, key=lambda name: float(np.median(resolved[name])), default=None)
+    if baseline is None:
+        return weakest, None
+    return weakest, {name: _losses(one) for name, one in resolved.items()}
+
+
+def _losses(ratio: Floats) -> dict[str, float]:
     return {
-        f"EI_{n}": {
-            str(percent): float(np.mean(one < 1.0 - percent / 100.0)) for percent in LOSSES_PERCENT
-        }
-        for n, one in enumerate(ratio.T, start=1)
+        str(percent): float(np.mean(ratio < 1.0 - percent / 100.0)) for percent in LOSSES_PERCENT
     }
 
 
@@ -279,14 +296,18 @@ def _summary(draws: Floats) -> ElementState:
 def _finding(found: FusedBridge, state: BridgeResult, baseline: BridgeResult | None) -> str:
     """Return the state in words: resolved and unresolved elements."""
     comparison = compared(state, found.nominal_nm2, found.element_lengths_m, baseline)
+    doubts: list[str] = []
+    if baseline is not None:
+        used, before = (frozenset(one.crossings_used) for one in (state, baseline))
+        doubts.extend(doubts_of_baseline(used, before, baseline.verdict))
     if _CONTRADICTIONS.intersection(state.reasons):
         # The excluded crossings may show what the others do not: no element is cleared.
         clear = [] if comparison is None else describe_clear_elements(comparison)
-        return " ".join([*clear, ENGLISH.text("contradicted")])
+        return " ".join([*clear, ENGLISH.text("contradicted"), *doubts])
     unresolved = unresolved_elements(state.elements.values())
     wording = describe_comparison(comparison, unresolved, state.level)
     if baseline is not None and comparison is not None:
         edges = np.concatenate([[0.0], np.cumsum(found.element_lengths_m)])
         weak = weak_before(estimate_of_state(baseline), found.nominal_nm2, edges)
         wording += describe_weak_before(weak)
-    return " ".join(wording)
+    return " ".join([*wording, *doubts])

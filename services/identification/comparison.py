@@ -16,6 +16,7 @@ from pre_core.constants import NORMAL_975
 from schemas.results import RESOLVED, BridgeResult, ElementState, Parameter
 from services.common.arrays import Floats
 from services.common.language import ENGLISH, Language
+from services.common.naming import entry_in_name
 
 CLEAR_LOSS = 0.1
 """Smallest stiffness loss that the whole 95 % interval of a weak element must exceed."""
@@ -38,6 +39,21 @@ def shared_crossings(used: Set[str], before: Set[str], language: Language = ENGL
     return language.choice("caution.same", len(common))
 
 
+def doubts_of_baseline(
+    used: Set[str], before: Set[str], verdict: str | None, language: Language = ENGLISH
+) -> Iterator[str]:
+    """Yield why a comparison with a baseline misleads: its `verdict`, or crossings that are later.
+
+    `used` and `before` are the crossings of the measurement and of the baseline.
+    """
+    if verdict not in (None, "good"):
+        yield language.text("caution.baseline_suspect")
+    entries = [[e for e in map(entry_in_name, of) if e is not None] for of in (before, used)]
+    if all(entries) and max(entries[0]) > max(entries[1]):
+        then, now = (f"{max(of):%Y-%m-%d}" for of in entries)
+        yield language.text("caution.baseline_later", then=then, now=now)
+
+
 def baseline_cautions(
     states: Mapping[str, BridgeResult], baselines: Mapping[str, BridgeResult]
 ) -> Iterator[str]:
@@ -58,6 +74,8 @@ class Estimate(NamedTuple):
     high: Floats
     scale_error: float = 0.0
     """Relative standard deviation common to all elements (mass, gain)."""
+    unresolved: frozenset[int] = frozenset()
+    """Numbers of elements too uncertain to resolve a loss of half their EI."""
 
 
 class Element(NamedTuple):
@@ -69,26 +87,28 @@ class Element(NamedTuple):
     ratio: float
     low: float
     high: float
+    is_comparable: bool = True
+    """Whether neither it nor its baseline is unresolved; otherwise no change is stated."""
 
     @property
     def is_weak(self) -> bool:
         """Whether it has clearly lost stiffness."""
-        return self.high < 1.0 - CLEAR_LOSS
+        return self.is_comparable and self.high < 1.0 - CLEAR_LOSS
 
     @property
     def is_stiff(self) -> bool:
         """Whether it is clearly stiffer."""
-        return self.low > 1.0 + CLEAR_LOSS
+        return self.is_comparable and self.low > 1.0 + CLEAR_LOSS
 
     @property
     def is_lower(self) -> bool:
         """Whether its interval excludes zero loss, but includes losses below `CLEAR_LOSS`."""
-        return self.high < 1.0 and not self.is_weak
+        return self.is_comparable and self.high < 1.0 and not self.is_weak
 
     @property
     def is_implausible(self) -> bool:
         """Whether it is stiffer than damage, weather and chance explain."""
-        return self.low > 1.0 + IMPLAUSIBLE_GAIN
+        return self.is_comparable and self.low > 1.0 + IMPLAUSIBLE_GAIN
 
     @property
     def visible_loss(self) -> float:
@@ -103,6 +123,8 @@ class Comparison(NamedTuple):
     median_ratio: float
     """Median of EI over its nominal value, meaningful only with a meaningful nominal value."""
     elements: tuple[Element, ...]
+    unresolved_before: frozenset[int] = frozenset()
+    """Numbers of elements that the baseline does not resolve."""
 
     @property
     def weak(self) -> tuple[Element, ...]:
@@ -136,7 +158,8 @@ def compare(
     """Compare elements with a baseline, or each with the median of all others.
 
     `nominal` (n,) in N·m², `edges_m` (n + 1,). Errors count as log-normal. Against a baseline those
-    of both add up. Among elements of one measurement the common error cancels, and the error of the
+    of both add up, and an element that either does not resolve is not comparable. Among elements
+    of one measurement the common error cancels, and the error of the
     median is added: that of a median of n - 1 is 1.25 times a mean's. Return None without a
     reference: fewer than three elements and no baseline, or an impossible value.
     """
@@ -165,10 +188,15 @@ def compare(
         more = 1.25 * np.median(widths, axis=1) / np.sqrt(count - 1)
     low = ratio * np.exp(-np.hypot(below, more))
     high = ratio * np.exp(np.hypot(above, more))
-    rows = zip(edges_m, edges_m[1:], ratio, low, high, strict=False)
-    elements = tuple(Element(n, *map(float, row)) for n, row in enumerate(rows, start=1))
+    before = frozenset[int]() if baseline is None else baseline.unresolved
+    vague = frozenset[int]() if baseline is None else estimate.unresolved | before
+    rows = np.column_stack((edges_m[:-1], edges_m[1:], ratio, low, high)).tolist()
+    elements = tuple(
+        Element(n, begin, end, of, low_end, high_end, n not in vague)
+        for n, (begin, end, of, low_end, high_end) in enumerate(rows, start=1)
+    )
     reference: Literal["baseline", "others"] = "others" if baseline is None else "baseline"
-    return Comparison(reference, float(np.median(relative)), elements)
+    return Comparison(reference, float(np.median(relative)), elements, before)
 
 
 def estimate_of_state(state: BridgeResult, lengths_m: Sequence[float] | None = None) -> Estimate:
@@ -178,7 +206,8 @@ def estimate_of_state(state: BridgeResult, lengths_m: Sequence[float] | None = N
     """
     table = np.array([(e.mean, e.q025, e.q975) for e in state.elements.values()]).reshape(-1, 3)
     mean, low, high = table.T
-    return Estimate(mean, low, high, _common_error(state, lengths_m))
+    unresolved = unresolved_elements(state.elements.values())
+    return Estimate(mean, low, high, _common_error(state, lengths_m), unresolved)
 
 
 def _common_error(state: BridgeResult, lengths_m: Sequence[float] | None) -> float:
@@ -240,19 +269,23 @@ def describe_comparison(
 ) -> list[str]:
     """Return sentences on the comparison; of unresolved elements they state only that.
 
-    `unresolved` are their numbers; with them the `level` of the bridge is stated. The caller states
-    `without` itself.
+    `unresolved` are their numbers; with them, or with some that the baseline does not resolve, the
+    `level` of the bridge is stated. The caller states `without` itself.
     """
-    if found is None or not unresolved:
+    every = unresolved if found is None else unresolved | found.unresolved_before
+    if found is None or not every:
         return sentences(found, language, without)
     wordings = describe_clear_elements(found, language)
-    others = ambiguous_neighbours(found, unresolved)
+    others = ambiguous_neighbours(found, every)
     if others:
         either = f" {language.text('or')} ".join(map(str, others))
         wordings.append(language.choice("may_be_beside", len(others), numbers=either))
-    if "unresolved" not in without:
-        wordings.append(_not_resolved(len(found.elements), unresolved, language))
-    resolved = tuple(e for e in found.rest if e.number not in unresolved)
+    if unresolved and "unresolved" not in without:
+        wordings.append(_not_resolved("unresolved", len(found.elements), unresolved, language))
+    if found.unresolved_before:
+        before, count = found.unresolved_before, len(found.elements)
+        wordings.append(_not_resolved("unresolved_before", count, before, language))
+    resolved = tuple(e for e in found.rest if e.number not in every)
     if resolved and "visible" not in without:
         wordings.append(language.text("rest.resolved", loss=_smallest_seen(resolved)))
     if level is not None:
@@ -293,12 +326,12 @@ def describe_clear_elements(found: Comparison, language: Language = ENGLISH) -> 
     return sentences(found._replace(elements=clear), language) if clear else []
 
 
-def _not_resolved(count: int, unresolved: Set[int], language: Language) -> str:
+def _not_resolved(key: str, count: int, unresolved: Set[int], language: Language) -> str:
     *others, last = sorted(unresolved)
     values = {"limit": 100.0 * RESOLVED, "last": last, "others": ", ".join(map(str, others))}
     if len(unresolved) == count:
-        return language.text("unresolved.all", **values)
-    return language.choice("unresolved", len(unresolved), **values)
+        return language.text(f"{key}.all", **values)
+    return language.choice(key, len(unresolved), **values)
 
 
 def sentences(

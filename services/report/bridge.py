@@ -285,17 +285,17 @@ def _finding(
     known = still_weak(view, baseline)
     if known:
         headline = language.choice("finding.known", len(known), elements=language.listed(known))
-        seen = () if missed is None else (_seen(view.comparison, language),)
+        seen = () if missed is None else tuple(_seen(view.comparison, language))
         kind = "known" if missed is None and not but else "open"
         return BridgeFinding(kind, headline + but, (*wording, *seen))
     if missed is None:
         kind = "open" if but else "sound"
         return BridgeFinding(kind, language.text("finding.none") + but, wording)
     # The headline names the unresolved elements unless they are most of them.
-    are_named = 2 * len(view.unresolved) <= len(view.comparison.elements)
+    are_named = 2 * len(view.vague) <= len(view.comparison.elements)
     without: tuple[Stated, ...] = ("visible", "unresolved") if are_named else ("visible",)
     described = describe_bridge(view, language, without)
-    sentences = (*described, *single, _seen(view.comparison, language))
+    sentences = (*described, *single, *_seen(view.comparison, language))
     return BridgeFinding("open", missed + but, sentences)
 
 
@@ -320,28 +320,31 @@ def _but_implausible(found: Comparison, language: Language) -> str:
 
 def _why_open(view: BridgeView, found: Comparison, language: Language) -> str | None:
     """Return why a loss may have been missed; None where one of each element would be clear."""
-    unresolved = sorted(view.unresolved)
-    if 2 * len(unresolved) > len(found.elements):
-        return language.text("finding.open")
-    if unresolved:
-        numbers = language.listed([str(number) for number in unresolved])
+    vague, before = sorted(view.vague), "_before" if found.unresolved_before else ""
+    if 2 * len(vague) > len(found.elements):
+        return language.text(f"finding.open{before}")
+    if vague:
+        numbers = language.listed([str(number) for number in vague])
         limit = 100.0 * RESOLVED
-        return language.choice("finding.partly", len(unresolved), elements=numbers, limit=limit)
+        key = f"finding.partly{before}"
+        return language.choice(key, len(vague), elements=numbers, limit=limit)
     if max(one.visible_loss for one in found.elements) > LARGEST_MISSED_LOSS:
         return language.text("finding.coarse", limit=100.0 * LARGEST_MISSED_LOSS)
     return None
 
 
-def _seen(found: Comparison, language: Language) -> str:
-    """Return from which loss on elements would have been called weak: the best and the worst."""
-    best, *_, worst = sorted(found.elements, key=lambda one: one.visible_loss)
-    return language.text(
-        "finding.seen",
-        low=per_cent_up(best.visible_loss),
-        best=best.number,
-        high=per_cent_up(worst.visible_loss),
-        worst=worst.number,
-    )
+def _seen(found: Comparison, language: Language) -> Iterator[str]:
+    """Yield from which loss on elements would have been called weak: the best and the worst."""
+    elements = sorted((e for e in found.elements if e.is_comparable), key=lambda e: e.visible_loss)
+    if elements:
+        best, worst = elements[0], elements[-1]
+        yield language.text(
+            "finding.seen",
+            low=per_cent_up(best.visible_loss),
+            best=best.number,
+            high=per_cent_up(worst.visible_loss),
+            worst=worst.number,
+        )
 
 
 def _reasons_of_state(

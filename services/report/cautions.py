@@ -18,6 +18,7 @@ from services.identification.comparison import (
     Element,
     compare,
     describe_weak_before,
+    doubts_of_baseline,
     shared_crossings,
 )
 from services.identification.comparison import weak_before as of_baseline
@@ -53,13 +54,13 @@ def cautions(measured: CautionBasis, language: Language) -> Iterator[str]:
     if measured.view.estimate is None:
         return
     yield from measured.validation
-    yield from _same_crossings(measured, language)
+    yield from _of_baseline(measured, language)
     comparison = measured.view.comparison
     if comparison is not None:
         yield from _implausible(comparison, language)
         yield from _implausible_before(measured, language)
         yield from _lower(measured.view, comparison, language)
-        if comparison.weak or 2 * len(measured.view.unresolved) <= len(comparison.elements):
+        if comparison.weak or 2 * len(measured.view.vague) <= len(comparison.elements):
             limit = 100.0 * CLEAR_LOSS
             yield language.text(f"caution.clearly.{comparison.reference}", limit=limit)
     yield from _earlier(measured, language)
@@ -92,13 +93,15 @@ def named_elements(numbers: Sequence[int], language: Language) -> str:
     return language.text(which, elements=language.listed([str(number) for number in numbers]))
 
 
-def _same_crossings(measured: CautionBasis, language: Language) -> Iterator[str]:
-    """Yield how many crossings the baseline shares with the measurement compared with it."""
-    if measured.before is None:
+def _of_baseline(measured: CautionBasis, language: Language) -> Iterator[str]:
+    """Yield why the baseline misleads: crossings it shares, a doubtful verdict, a later time."""
+    before, used = measured.before, measured.view.used
+    if before is None:
         return
-    caution = shared_crossings(measured.view.used, measured.before.used, language)
+    caution = shared_crossings(used, before.used, language)
     if caution is not None:
         yield caution
+    yield from doubts_of_baseline(used, before.used, before.verdict, language)
 
 
 def _implausible(comparison: Comparison, language: Language) -> Iterator[str]:

@@ -22,6 +22,7 @@ from services.report.quality import reasons_of
 from services.report.sketch import sketch
 from services.report.style import style_sheet
 from services.viewer.bridge_figure import draw_bridge
+from services.viewer.bridge_view import BridgeView
 from services.viewer.drawing import STYLE, figure_bytes
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
@@ -226,7 +227,7 @@ def _elements(report: BridgeReport, language: Language) -> Html:
     for n, mean in enumerate(view.estimate.mean):
         low, high = view.estimate.low[n] / 1e9, view.estimate.high[n] / 1e9
         element = compared[n] if compared else None
-        remark = _remark(n + 1, element, view.unresolved, earlier)
+        remark = _remark(n + 1, element, view, earlier)
         ratio = language.number(mean / view.nominal_nm2[n], ".3f")
         change = "" if element is None else _change(element, language)
         ends = {"from_m": view.edges_m[n], "to_m": view.edges_m[n + 1]}
@@ -248,20 +249,22 @@ def _elements(report: BridgeReport, language: Language) -> Html:
 def _remark(
     number: int,
     element: Element | None,
-    unresolved: Collection[int],
+    view: BridgeView,
     earlier: Collection[int],
 ) -> str:
     """Return the key of the remark on an element; empty for none.
 
-    `element` is its comparison, if there is one; `unresolved` and `earlier` are the numbers of
-    unresolved elements and of those that were weak in the baseline.
+    `element` is its comparison, if there is one; `earlier` are the numbers of elements that were
+    weak in the baseline.
     """
     if element is not None and element.is_weak:
         return "weak"
     if element is not None and element.is_stiff:
         return "implausible" if element.is_implausible else "stiff"
-    if number in unresolved:
+    if number in view.unresolved:
         return "unresolved"
+    if number in view.vague:
+        return "unresolved_before"
     if number in earlier:
         return "earlier"
     return "lower" if element is not None and element.is_lower else ""

@@ -62,9 +62,15 @@ class BridgeView(NamedTuple):
         return unresolved_elements(self.state.elements.values())
 
     @property
+    def vague(self) -> frozenset[int]:
+        """Numbers of elements that the measurement or its baseline does not resolve."""
+        found = self.comparison
+        return self.unresolved if found is None else self.unresolved | found.unresolved_before
+
+    @property
     def ambiguous_neighbours(self) -> tuple[int, ...]:
         """Unresolved neighbours of weak elements, where the loss may be instead."""
-        return comparison.ambiguous_neighbours(self.comparison, self.unresolved)
+        return comparison.ambiguous_neighbours(self.comparison, self.vague)
 
 
 def views_of_bridges(

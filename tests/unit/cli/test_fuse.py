@@ -1,5 +1,6 @@
 """What `driveby fuse` says beside its table."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -70,6 +71,24 @@ def test_baseline_of_the_site_file_is_compared_with(tmp_path: Path) -> None:
     of_site, given, without = states
     assert of_site == given
     assert without.probability_of_loss is None is not given.probability_of_loss
+
+
+def test_unresolved_element_of_the_baseline_has_no_printed_loss(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = write(tmp_path / "first.json", [crossing(n) for n in range(2)])
+    before = tmp_path / "before.json"
+    assert main(["fuse", str(first), "--json", str(before)]) == 0
+    results = json.loads(before.read_text())
+    results["bridges"]["bridge-1"]["EI_2"] |= {"mean": 5e10, "std": 2.5e10, "q975": 1e11}
+    before.write_text(json.dumps(results))
+    second = write(tmp_path / "second.json", [crossing(n) for n in range(2, 4)])
+    capsys.readouterr()
+    assert main(["fuse", str(second), "--baseline", str(before)]) == 0
+    out = capsys.readouterr().out
+    (line,) = (line for line in out.splitlines() if "EI_2" in line)
+    assert line.rstrip().endswith("not resolved")
+    assert "Element 2 is not resolved in the baseline" in " ".join(out.split())
 
 
 @pytest.mark.parametrize("command", ["fuse", "report"])

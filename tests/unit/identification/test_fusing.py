@@ -11,6 +11,7 @@ from schemas.reasons import BridgeReason, LeftOutReason, Reason
 from schemas.results import (
     BridgeResult,
     CrossingResult,
+    ElementState,
     ResultHeader,
     load_results,
     results,
@@ -232,6 +233,43 @@ def test_probabilities_of_loss_are_against_a_baseline() -> None:
     assert below is not None
     assert below["EI_3"] > 0.99
     assert below["EI_1"] < 0.05
+
+
+def test_element_unresolved_in_the_baseline_gets_no_claim() -> None:
+    """Its interval would make EI_2 a loss of 80 % and the weakest element."""
+    before = state([crossing(n, (1.0,) * ELEMENTS) for n in range(6)])
+    vague = ElementState(mean=5e10, std=2.5e10, q025=1.2e10, q975=1e11)
+    before = before.model_copy(update={"EI_2": vague, "verdict": "suspect"})
+    now = state([crossing(n) for n in range(10, 16)], FusionSettings({"bridge-1": before}))
+    assert now.weakest_element == "EI_3"
+    assert now.probability_of_loss is not None
+    assert list(now.probability_of_loss) == ["EI_1", "EI_3", "EI_4", "EI_5"]
+    assert now.finding is not None
+    assert "Element 2 is not resolved in the baseline (standard deviation above" in now.finding
+    assert "Element 2, 6.0" not in now.finding
+    assert "The loss may also be in element 2" in now.finding
+    assert "The baseline is a suspect measurement" in now.finding
+    derived = against(crossing(20), before).derived
+    assert derived is not None
+    below = derived.probability_below_90_percent_of_baseline
+    assert below is not None
+    assert "EI_2" not in below
+
+
+def test_baseline_that_is_later_is_named() -> None:
+    def dated(number: int, day: str) -> CrossingResult:
+        name = f"truck-1.bridge-1.{day}T1{number}0000.000Z"
+        return crossing(number).model_copy(update={"crossing_id": name})
+
+    early = state([dated(n, "20260101") for n in range(2)])
+    late = state([dated(n, "20270101") for n in range(2)])
+    words = "later crossings (until 2027-01-01) than this measurement (until 2026-01-01)"
+    for crossings, before, is_named in (("20260101", late, True), ("20270101", early, False)):
+        fusing = FusionSettings({"bridge-1": before})
+        found = state([dated(n, crossings) for n in range(2)], fusing)
+        assert found.finding is not None
+        assert (words in found.finding) is is_named
+        assert "is a suspect measurement" not in found.finding
 
 
 def test_other_methods_and_older_results_are_not_fused() -> None:

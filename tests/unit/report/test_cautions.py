@@ -11,7 +11,7 @@ from matplotlib import rc_context
 
 from schemas.alarms import Acknowledgement
 from schemas.reasons import REASON_TEXTS, Reason
-from schemas.results import Results, results_json
+from schemas.results import ElementState, Results, results_json
 from schemas.site import Site
 from services.common.language import LANGUAGES, language_of
 from services.history.bridge_history import BridgeHistory, ElementChange, PeriodComparison
@@ -27,7 +27,7 @@ from services.viewer.drawing import STYLE
 from tests.builders.certificates import certificate
 from tests.unit.history.test_bridge_history import alarm
 from tests.unit.history.test_history_store import BEGIN_S
-from tests.unit.report.test_report import KNOWN, Seen, fused, reported
+from tests.unit.report.test_report import KNOWN, Seen, fused, reported, without_weak
 from tests.unit.viewer.found import RATIOS, results_of, some_crossing
 
 GAP, OUTAGE = Reason.GAP_ON_BRIDGE, Reason.POSITION_OUTAGE
@@ -111,6 +111,23 @@ def test_implausible_baseline_takes_certainty_from_changes(site: Site, tmp_path:
     now = results_of(site, some_crossing("z"), used="z")
     assert words in first_page(reported(site, now, baseline=path))
     assert "The baseline is not plausible" not in first_page(reported(site, now))
+
+
+def test_element_unresolved_in_the_baseline_is_named(site: Site, tmp_path: Path) -> None:
+    """A mean far above the present value is no loss where the baseline does not resolve it."""
+    sound = without_weak(site, [0.02] * 7)
+    state = sound.bridges["bridge-1"]
+    mean = 5.0 * state.elements["EI_2"].mean
+    vague = ElementState(mean=mean, std=0.5 * mean, q025=0.9 * mean, q975=2.5 * mean)
+    state = state.model_copy(update={"EI_2": vague, "verdict": "suspect"})
+    path = tmp_path / "vague.json"
+    path.write_text(results_json(sound.model_copy(update={"bridges": {"bridge-1": state}})))
+    text = first_page(reported(site, sound, baseline=path))
+    assert "The change of element 2 could not be determined (standard deviation above" in text
+    assert "Element 2 is not resolved in the baseline" in text
+    assert "The baseline is a suspect measurement: do not rely on a change from it." in text
+    assert "Element 2, " not in text
+    assert ") not resolved in the baseline" in text  # the remark in the table
 
 
 def test_interval_without_zero_is_possibly_less_stiff(site: Site, then: Path) -> None:
