@@ -160,7 +160,8 @@ BRIDGE_REASON_TEXTS: Final[dict[BridgeReason, str]] = {
         "The method provides no likelihood to fuse; this is the latest crossing alone."
     ),
     BridgeReason.CROSSINGS_DISAGREE: (
-        "Crossings disagree by more than their uncertainty explains, and are too few to find the "
+        "Over all elements or truck values together, crossings scatter by more than their "
+        "uncertainty explains, even if single intervals overlap; they are too few to find the "
         "wrong one."
     ),
     BridgeReason.NEWEST_DISAGREE: (

@@ -33,6 +33,7 @@ from services.report.cautions import CautionBasis, cautions
 from services.report.earlier import Before, SurveyFile, before_of, combined_surveys
 from services.report.quality import MAX_REASONS, quality, realm_of, reasons_of
 from services.viewer.bridge_view import BridgeView, describe_bridge, view_of_bridge
+from services.viewer.crossing_view import CrossingView
 
 _LATEST_S = 7_258_118_400.0
 """The year 2200, as a Unix time in s."""
@@ -234,14 +235,25 @@ def _one_by_one(
         assert crossing.interval_nm2 is not None  # noqa: S101
         estimate = Estimate(crossing.rigidity_nm2, *crossing.interval_nm2.T)
         found.append(compare(estimate, view.nominal_nm2, view.edges_m, baseline))
-    number, elements = 0, []
+    number, elements, is_narrower = 0, list[str](), list[bool]()
     for weak in view.comparison.weak:
         losses = [1.0 - one.elements[weak.number - 1].ratio for one in found if one is not None]
         if len(losses) >= 2:
             number, text = len(losses), _range_of(losses, language)
             elements.append(language.text("losses.element", element=weak.number, losses=text))
+            is_narrower.append(_is_narrower(view, good, weak.number - 1))
     if elements:
-        yield language.text("finding.scatter", number=number, elements=language.listed(elements))
+        key = "single" if len(view.used) < 2 else "narrower" if all(is_narrower) else "wider"
+        listed = language.listed(elements)
+        yield language.text(f"finding.scatter.{key}", number=number, elements=listed)
+
+
+def _is_narrower(view: BridgeView, crossings: Sequence[CrossingView], n: int) -> bool:
+    """Return whether the state's interval of element `n`, from 0, is narrower than each alone."""
+    assert view.estimate is not None  # noqa: S101 - its elements were compared
+    whole = view.estimate.high[n] / view.estimate.low[n]
+    alone = (one.interval_nm2[n] for one in crossings if one.interval_nm2 is not None)
+    return bool(whole < min(high / low for low, high in alone))
 
 
 def _range_of(losses: Sequence[float], language: Language) -> str:

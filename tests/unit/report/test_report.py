@@ -270,17 +270,30 @@ def test_what_single_crossings_say_of_a_weak_element_shows_how_far_they_scatter(
     third = results_of(site, some_crossing("c", verdict="suspect", reasons=("position_outage",)))
     everything = one.crossings + other.crossings + third.crossings
     merged = other.model_copy(update={"crossings": everything})
-    output = "From each of the 2 good crossings alone, element 4 is 50 to 60 % less stiff; the"
+    output = "From each of the 2 good crossings alone, element 4 is 50 to 60 % less stiff."
     assert output in reported(site, merged).text
     assert "crossings alone" not in reported(site, one).text
     ratios[3] = 1.2
     stiff = results_of(site, some_crossing("b", entry=60.0), used="a", ratios=ratios)
     mixed = stiff.model_copy(update={"crossings": one.crossings + stiff.crossings[:1]})
     mixed = mixed.model_copy(update={"bridges": one.bridges})
-    output = "alone, element 4 is between 20 % stiffer and 60 % less stiff; the estimate"
+    output = "alone, element 4 is between 20 % stiffer and 60 % less stiff."
     assert output in reported(site, mixed).text
     german = reported(site, mixed, language="de").text
-    assert "ist Element 4 zwischen 20 % steifer und 60 % weniger steif; die" in german
+    assert "ist Element 4 zwischen 20 % steifer und 60 % weniger steif." in german
+
+
+@pytest.mark.parametrize(
+    ("spread", "words"),
+    [(0.005, "; the estimate from all together is more"), (0.05, "; the interval of all together")],
+)
+def test_only_a_narrower_interval_is_called_more_precise(
+    site: Site, spread: float, words: str
+) -> None:
+    """The state includes the variability between crossings, so it may be wider than the best."""
+    text = reported(site, fused(site, [0.03] * 3 + [spread] + [0.03] * 3)).text
+    assert f"3 good crossings alone, element 4 is 60 % less stiff{words}" in text
+    assert ("more precise" in text) == (spread < 0.01)
 
 
 def test_an_element_that_seems_stiffer_is_a_warning_of_its_neighbours(
@@ -664,7 +677,10 @@ def test_a_state_that_is_suspect_is_doubtful_though_its_crossings_are_good(site:
     reasons = {"verdict": "suspect", "reasons": ["crossings_disagree"]}
     found = reported(site, fused(site, KNOWN, **reasons))
     assert ("class", "finding doubtful") in found.attributes
-    assert "The reasons: Crossings disagree by more than their uncertainty" in found.text
+    assert (
+        "The reasons: Over all elements or truck values together, crossings scatter by more"
+        in found.text
+    )
     assert "this measurement is suspect" in found.text
 
 
@@ -832,7 +848,7 @@ def test_the_words_that_are_used_are_explained_and_no_others(site: Site) -> None
     ):
         assert word in words
     assert "Channel:" not in words
-    assert "Scatter: One crossing is less precise than all together" in words
+    assert "Scatter: Noise, speed and temperature differ from crossing" in words
     rejected = some_crossing("a", verdict="rejected", reasons=("channel_swapped",))
     words = reported(site, results_of(site, rejected)).text.rpartition(" Words ")[2]
     assert "sprung_front and sprung_rear are on the body above an axle" in words
