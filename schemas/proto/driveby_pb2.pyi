@@ -578,7 +578,7 @@ class Track(_message.Message):
     def __init__(self, vehicle: _Optional[str] = ..., direction: _Optional[_Union[Direction, str]] = ..., common_share: _Optional[float] = ..., wander_m: _Optional[float] = ...) -> None: ...
 
 class Health(_message.Message):
-    __slots__ = ("schema_version", "time_ns", "service", "ok", "figures", "note")
+    __slots__ = ("schema_version", "time_ns", "service", "ok", "figures", "note", "ended")
     class FiguresEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -592,13 +592,15 @@ class Health(_message.Message):
     OK_FIELD_NUMBER: _ClassVar[int]
     FIGURES_FIELD_NUMBER: _ClassVar[int]
     NOTE_FIELD_NUMBER: _ClassVar[int]
+    ENDED_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     time_ns: int
     service: str
     ok: bool
     figures: _containers.ScalarMap[str, float]
     note: str
-    def __init__(self, schema_version: _Optional[int] = ..., time_ns: _Optional[int] = ..., service: _Optional[str] = ..., ok: _Optional[bool] = ..., figures: _Optional[_Mapping[str, float]] = ..., note: _Optional[str] = ...) -> None: ...
+    ended: bool
+    def __init__(self, schema_version: _Optional[int] = ..., time_ns: _Optional[int] = ..., service: _Optional[str] = ..., ok: _Optional[bool] = ..., figures: _Optional[_Mapping[str, float]] = ..., note: _Optional[str] = ..., ended: _Optional[bool] = ...) -> None: ...
 
 class Progress(_message.Message):
     __slots__ = ("schema_version", "time_ns", "crossing_id", "stage", "fraction")

@@ -56,13 +56,13 @@ class HealthBoard:
         return True
 
     def services(self, now_s: float) -> list[ServiceFigures]:
-        """Return all services; the figures of one that has become silent are left out."""
+        """Return all services; the figures of one that is silent or has ended are left out."""
         with self._lock:
             latest = dict(self._latest)
         found = []
         for (realm, service), message in latest.items():
             time_s = message.time_ns * 1e-9
-            is_recent = now_s - time_s <= OLDEST_S
+            is_recent = now_s - time_s <= OLDEST_S and not message.ended
             figures = message.figures if is_recent else {}
             if now_s - time_s <= _FORGOTTEN_S:
                 found.append(

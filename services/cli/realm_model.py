@@ -118,6 +118,8 @@ class ServiceRow(NamedTuple):
     time_ns: int
     figures: dict[str, float]
     note: str
+    ended: bool = False
+    """Whether it has stopped in order."""
 
 
 class RealmModel:
@@ -255,7 +257,8 @@ class RealmModel:
         if bridge not in self.bridges and len(self.bridges) >= _MAX_BRIDGES:
             self.bridges.pop(next(iter(self.bridges)))
         used = len(state.crossings_used)
-        row = BridgeRow(used, state.verdict or "", ratios, weak, lowest, state.finding or "")
+        finding = state.finding or ("" if lowest else " ".join(state.reason_texts))
+        row = BridgeRow(used, state.verdict or "", ratios, weak, lowest, finding)
         if self.bridges.get(bridge) == row:
             return None
         self.bridges[bridge] = row
@@ -283,9 +286,14 @@ class RealmModel:
     def _take_health(self, name: str, message: pb.Health) -> str:
         if name not in self.services and len(self.services) >= _MAX_SERVICES:
             self.services.pop(next(iter(self.services)))
-        service = ServiceRow(message.ok, message.time_ns, dict(message.figures), message.note)
+        service = ServiceRow(
+            message.ok, message.time_ns, dict(message.figures), message.note, message.ended
+        )
         self.services[name] = service
         figures = service_figures(service)
+        if service.ended:
+            self.work.pop(name, None)
+            return f"{name} has ended" + ("" if service.ok else f", NOT WELL: {figures}")
         return f"{name} is {'well' if service.ok else 'NOT WELL'}{figures and f': {figures}'}"
 
     def _take_progress(self, service: str, message: pb.Progress) -> None:

@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from schemas.alarms import Alarm
-from schemas.topics import is_from_recording
+from schemas.topics import HEALTH_PERIOD_S, is_from_recording
 from services.bus.realm_listener import other_realms_hint
 from services.cli.realm_model import (
     SILENT_S,
@@ -36,6 +36,8 @@ _OLD_S: Final = 60.0
 """Age in s at arrival from which samples are old."""
 _LATE_S: Final = 150.0
 """Silence in s after which a service is unhealthy, as for `driveby health`."""
+_OLD_WORK_S: Final = 1.5 * HEALTH_PERIOD_S
+"""Silence in s after which the progress of a service is not shown: it may have been killed."""
 _MAX_ALARMS: Final = 4
 """Maximum number of alarm lines at the head of a page, fewer on a low one."""
 _MAX_BRIDGES: Final = 4
@@ -269,12 +271,16 @@ def _services(model: RealmModel, now_ns: int) -> Table:
     for name, service in sorted(model.services.items()):
         age_s = (now_ns - service.time_ns) * 1e-9
         state = Text("well", style="green")
-        if age_s > _LATE_S:
+        if service.ended:
+            how = "dim" if service.ok else "red"
+            state = Text(f"ended {_length(age_s)} ago", style=how)
+        elif age_s > _LATE_S:
             state = Text(f"silent {_length(age_s)}", style="red")
         elif not service.ok:
             state = Text("not well", style="red")
-        work = "" if age_s > _LATE_S else model.work.get(name, "")
-        notes = [service_figures(service), work]
+        work = "" if age_s > _OLD_WORK_S else model.work.get(name, "")
+        is_plain = service.ended and service.ok
+        notes = ["" if is_plain else service_figures(service), work]
         table.add_row(name, state, "; ".join(one for one in notes if one))
     return table
 

@@ -329,7 +329,7 @@ class _Announcements:
                 version = self._publish_durable()
             if closing or time.monotonic() >= next_health_s:
                 next_health_s = time.monotonic() + HEALTH_PERIOD_S
-                self._publish_health()
+                self._publish_health(ended=closing)
                 give_back_memory()
             if closing:
                 return
@@ -358,7 +358,7 @@ class _Announcements:
             self._publisher(realm).put("service", self._logger.service_id, "durable", payload)
         return version
 
-    def _publish_health(self) -> None:
+    def _publish_health(self, *, ended: bool) -> None:
         writer = self._logger.writer
         figures: dict[str, float] = dict(count_all(self._logger.intake.counts, writer))
         figures |= writer.take_figures()
@@ -373,6 +373,7 @@ class _Announcements:
             ok=writer.failure is None and not writer.dropped and not writer.room.is_low,
             figures={name: float(value) for name, value in figures.items()},
             note="; ".join(note for note in notes if note),
+            ended=ended,
         )
         realm = self._logger.place.realm or "live"
         payload = message.SerializeToString(deterministic=True)

@@ -119,6 +119,7 @@ def _run(asked: WorkerSettings, search: Search, ready: Callable[[], None] | None
             with set_by_signals(signal.SIGHUP) as requested:
                 editing = None if watch is None else SiteReload(watch, requested, search)
                 Loop(service, receiver.queued, stop, backfill, editing).run(ready)
+            service.publish_end()
         except BaseException:
             files.abandon()
             raise

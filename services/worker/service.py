@@ -95,6 +95,13 @@ class WorkerService:
             verdicts=self.verdicts, note=self.certificates.note,
         )  # fmt: skip
 
+    def publish_end(self) -> None:
+        """Publish as the last `health` that the worker ends in order."""
+        health = pb.Health(
+            schema_version=1, time_ns=time.time_ns(), service=self.id, ok=True, ended=True
+        )
+        self.publisher.put("service", self.id, "health", health.SerializeToString())
+
     def resume(self, earlier: EarlierRuns) -> None:
         """Resume earlier runs: republish what may not have been received, and finish the rest.
 

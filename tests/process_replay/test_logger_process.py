@@ -221,6 +221,7 @@ def test_full_disk_is_reported_and_ends_the_logger(
             output.append(received)
     health = [pb.Health.FromString(r.payload) for r in output if r.key_text.endswith("health")]
     assert not health[-1].ok
+    assert health[-1].ended
     events = [decode_event(r.payload) for r in output if r.key_text.endswith("event")]
     assert EventKind.WRITE_ERROR in [event.kind for event in events]
     info = read_info(tmp_path / "live.mcap")

@@ -303,6 +303,20 @@ def test_a_second_truck_does_not_keep_the_first_from_leaving(
     assert [ratio_of(one) for one in estimates] == [pytest.approx(0.4, rel=0.01)]
 
 
+def test_last_health_of_a_worker_is_its_end(
+    bus: zenoh.Session, worker: Begin, terminate: End
+) -> None:
+    with Subscription(bus, selector(REALM, "service", "health")) as health:
+        process = worker()
+        up_to(health, "health")
+        terminate(process)
+        while True:
+            one = health.receive(LONGEST_S)
+            assert one is not None, "the end was not published"
+            if pb.Health.FromString(one.payload).ended:
+                break
+
+
 def test_a_signal_ends_a_worker_that_waits_for_a_router(
     worker: Begin,
 ) -> None:

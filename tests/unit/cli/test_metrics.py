@@ -34,10 +34,11 @@ NAMES = {metric.figure for metric in METRICS}
 OF_WORKER = QueueLag(3, 0.5), Workload(("a",), 1, 2, WaitingCounts(1, 2))
 
 
-def health(time_s: float, **figures: float) -> bytes:
+def health(time_s: float, *, ended: bool = False, **figures: float) -> bytes:
     message = pb.Health(
-        schema_version=1, time_ns=round(time_s * 1e9), service="logger", ok=True, figures=figures
-    )
+        schema_version=1, time_ns=round(time_s * 1e9), service="logger", ok=True, ended=ended,
+        figures=figures,
+    )  # fmt: skip
     return message.SerializeToString()
 
 
@@ -76,6 +77,9 @@ def test_silent_service_is_not_well_and_has_no_figures() -> None:
     assert board.add(sample("logger", health(1000.0, dropped=1.0)))
     [now] = board.services(1010.0)
     assert (now.is_well, dict(now.figures)) == (True, {"dropped": 1.0})
+    assert board.add(sample("logger", health(1005.0, ended=True)))
+    assert not board.services(1010.0)[0].is_well
+    assert board.add(sample("logger", health(1000.0, dropped=1.0)))
     [late] = board.services(1000.0 + OLDEST_S + 1.0)
     assert (late.is_well, dict(late.figures)) == (False, {})
     assert late.time_s == pytest.approx(1000.0)

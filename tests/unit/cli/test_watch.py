@@ -7,6 +7,9 @@ import pytest
 from rich.console import Console
 
 from schemas.proto import driveby_pb2 as pb
+from schemas.reasons import BridgeReason
+from schemas.results import BridgeResult
+from schemas.results_on_the_wire import bridge_to_protobuf
 from schemas.signals import Identity
 from schemas.site import Site
 from services.bus.realm_listener import BusMessage
@@ -344,6 +347,38 @@ def test_clock_that_is_behind_is_explained() -> None:
     assert [one for one in lines if "equally old" in one] == [f"{output}, or this one's ahead"]
     replayed = drawn(watched, listened=Listened("replay-monday"))
     assert not any("equally old" in one for one in replayed)
+
+
+def test_service_that_ended_is_not_well(site: Site) -> None:
+    watched = a_morning(site)
+    deliver(watched, progress("worker", "", "validating truck-1 on bridge-1", 0.58))
+    assert "58 %" in line(drawn(watched), "worker")
+    assert deliver(watched, health("worker", ended=True)) == "worker has ended"
+    assert line(drawn(watched), "worker") == "worker ended 12 s ago"
+    failed = deliver(watched, health("worker", ok=False, ended=True, note="disk full"))
+    assert failed == "worker has ended, NOT WELL: disk full"
+    assert line(drawn(watched), "worker") == "worker ended 12 s ago disk full"
+    deliver(watched, health("worker", queue=0.0))  # started again
+    assert line(drawn(watched), "worker") == "worker well queue 0"
+
+
+def test_progress_of_a_killed_service_is_not_kept(site: Site) -> None:
+    watched = a_morning(site)
+    deliver(watched, progress("worker", "", "validating truck-1 on bridge-1", 0.58))
+    row = watched.services["worker"]
+    watched.services["worker"] = row._replace(time_ns=NOW_NS - 100_000_000_000)
+    assert "58 %" not in line(drawn(watched), "worker")
+
+
+def test_bridge_without_a_good_crossing_has_its_reason(site: Site) -> None:
+    watched = RealmModel()
+    deliver(watched, estimate(result(site, "a", verdict="suspect", reasons=("model_misfit",))))
+    rejected = BridgeResult(verdict="rejected", reasons=(BridgeReason.NO_GOOD_CROSSING,))  # type: ignore[call-arg]
+    payload = bridge_to_protobuf("bridge-1", NOW_NS, rejected).SerializeToString()
+    words = "No crossing of the bridge is good."
+    printed = deliver(watched, heard("bridge", "bridge-1", "state", payload))
+    assert printed == f"bridge-1 by 0 crossings: {words}"
+    assert line(drawn(watched), "bridge-1").endswith(f"rejected: {words}")
 
 
 class Batches(Listened):

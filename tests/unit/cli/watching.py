@@ -135,10 +135,12 @@ def alarm(
     return heard("bridge", bridge, "alarm", encode_alarm(found, NOW_NS))
 
 
-def health(name: str, *, ok: bool = True, note: str = "", **figures: float) -> BusMessage:
+def health(
+    name: str, *, ok: bool = True, note: str = "", ended: bool = False, **figures: float
+) -> BusMessage:
     message = pb.Health(
         schema_version=1, time_ns=NOW_NS - 12_000_000_000, service=name, ok=ok,
-        figures=figures, note=note,
+        figures=figures, note=note, ended=ended,
     )  # fmt: skip
     return heard("service", name, "health", message.SerializeToString())
 
