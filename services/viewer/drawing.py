@@ -58,6 +58,7 @@ _CHARACTERS = 118
 """Maximum length of a line of reasons between the figure's edges."""
 _BESIDE_VERDICT = 110
 """Maximum length of a finding next to the word of a good verdict."""
+_OMITTED = " …"
 
 NOMINAL_LINE: dict[str, Any] = {"color": MUTED, "linewidth": 1.0, "linestyle": (0, (4, 3))}
 BASELINE_COLOUR = VERDICT_COLOURS["good"]
@@ -109,14 +110,17 @@ def figure_bytes(figure: Figure, form: str, *, dpi: int = DPI) -> bytes:
 
 
 def _beside_verdict(sentences: Sequence[str]) -> str:
-    """Return the first sentence with the number of the others, which may cost no part of it."""
-    others = len(sentences) - 1
+    """Return the first sentence with a note on the others, which costs no part of it.
+
+    A bare number of the others would read as one of weak elements.
+    """
+    first, others = sentences[0], len(sentences) - 1
     if not others:
-        return shortened(sentences[0], _BESIDE_VERDICT)
-    for more in (f" (and {count_of(others, 'more sentence')})", f" (and {others} more)"):
-        if len(sentences[0]) + len(more) <= _BESIDE_VERDICT:
-            break
-    return shortened(sentences[0], _BESIDE_VERDICT - len(more)) + more
+        return shortened(first, _BESIDE_VERDICT)
+    if len(first) > _BESIDE_VERDICT - len(_OMITTED):
+        return shortened(first, _BESIDE_VERDICT - len(_OMITTED))
+    note = f" (and {count_of(others, 'more sentence')})"
+    return first + (note if len(first) + len(note) <= _BESIDE_VERDICT else _OMITTED)
 
 
 def draw_verdict(
@@ -128,7 +132,7 @@ def draw_verdict(
 ) -> None:
     """Write the verdict below a heading: a word if it is good, a banner with reasons if not.
 
-    The first of the `sentences` stands next to a good one, with the number of the others.
+    The first of the `sentences` stands next to a good one, with a note on the others.
     """
     words: dict[str, Any] = {"fontsize": 9.5, "va": "top"}
     if verdict == "good":

@@ -260,14 +260,14 @@ def test_a_good_crossing_says_what_is_weak_and_by_how_much(site: Site) -> None:
     ("first", "written_as"),
     [
         (60, "(and 2 more sentences)"),
-        (95, "(and 2 more)"),
+        (95, "…"),  # not "(and 2 more)", which reads as two more weak elements
     ],
 )
 def test_number_of_other_sentences_costs_no_interval(first: int, written_as: str) -> None:
     sentence = "x" * (first - 30) + " (95 % interval 59 to 61 %).  "
     assert _beside_verdict([sentence, "b", "c"]) == f"{sentence} {written_as}"
     long = "x" * 70 + " less (95 % interval 59 to 61 %), by 2 standard deviations of the others."
-    assert _beside_verdict([long, "b", "c"]) == "x" * 70 + " less … (and 2 more)"
+    assert _beside_verdict([long, "b", "c"]) == "x" * 70 + " less …"
     assert _beside_verdict([sentence]) == sentence
 
 
