@@ -15,12 +15,12 @@ from matplotlib.figure import Figure
 
 from services.common.arrays import Floats
 from services.common.language import ENGLISH, Language
+from services.identification.comparison import Estimate
 from services.viewer.bridge_view import BridgeView, summary_of_bridge
 from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView
 from services.viewer.drawing import (
     BANNERS,
     BAR_EDGE,
-    BASELINE_COLOUR,
     INK,
     LEFT,
     MUTED,
@@ -32,21 +32,28 @@ from services.viewer.drawing import (
     add_ratio_axis,
     bar_places,
     draw_bars,
-    draw_intervals,
-    label_bars,
-    label_losses,
     legend_beside_title,
     mark_bridge,
     simplify_axes,
     simplify_numbers,
-    top_above_labels,
     write_centred,
     write_figure,
 )
+from services.viewer.element_labels import (
+    AFTER,
+    BEFORE,
+    anchors_clear_of,
+    cut_height,
+    draw_baseline,
+    draw_intervals,
+    end_with_names,
+    label_losses,
+    label_values,
+    name_elements,
+    top_above_labels,
+)
 
 _MAX_LISTED = 12
-_BEFORE, _AFTER = (0.02, 0.42), (0.42, 1.0)
-"""Parts of an element that the bars of baseline and state take."""
 _ABOVE_LEGEND_PT = 22.0
 """Distance of the title from the panel, with the legend between them, in points."""
 _SIGNS = {"good": "●", "unused": "○", "suspect": "◇", "rejected": "×"}
@@ -88,6 +95,7 @@ def draw_bridge(
 
 def _draw_panel(axes: Axes, bridge: BridgeView, language: Language) -> None:
     nominal = bridge.nominal_nm2 / 1e9
+    axes.set_xlim(-0.03 * bridge.span_m, 1.03 * bridge.span_m)
     axes.set_ylabel(language.text("figure.ei"))
     label = language.text("figure.nominal")
     axes.stairs(nominal, bridge.edges_m, baseline=None, label=label, **NOMINAL_LINE)
@@ -95,7 +103,7 @@ def _draw_panel(axes: Axes, bridge: BridgeView, language: Language) -> None:
     if bridge.estimate is None:
         write_centred(axes, _why_nothing(bridge))
     else:
-        top = max(top, _draw_state(axes, bridge, language))
+        top = end_with_names(axes, max(top, _draw_state(axes, bridge, language)))
     axes.set_ylim(0.0, top)
     legend_beside_title(axes)
     title = language.text("figure.rigidity")
@@ -107,20 +115,24 @@ def _draw_panel(axes: Axes, bridge: BridgeView, language: Language) -> None:
     if _meaning(bridge) == "ratio":
         add_ratio_axis(axes, nominal, language)
     mark_bridge(axes, (0.0, *bridge.interior_supports_m, bridge.span_m))
-    axes.set_xlim(-0.03 * bridge.span_m, 1.03 * bridge.span_m)
     axes.set_xlabel(language.text("figure.chainage"))
 
 
 def _draw_state(axes: Axes, bridge: BridgeView, language: Language) -> float:
     """Draw the state, the baseline next to it and single crossings; return the axis' end."""
     assert bridge.estimate is not None  # noqa: S101 - its caller checked
-    mean, low, high = (column / 1e9 for column in bridge.estimate[:3])
-    highest, places = float(high.max()), bar_places(bridge.edges_m)
-    if bridge.baseline is not None:
-        before, places = _BEFORE, bar_places(bridge.edges_m, *_AFTER)
-        highest = max(
-            highest, _draw_before(axes, bridge, bar_places(bridge.edges_m, *before), language)
-        )
+    mean, low, high = columns = _columns(bridge.estimate)
+    before = None if bridge.baseline is None else _columns(bridge.baseline)
+    drawn = [c for c in bridge.crossings if c.rigidity_nm2 is not None]
+    dots = _dots(drawn, mean.size)
+    resolved = [n for n in range(mean.size) if n + 1 not in bridge.unresolved]
+    highest = max(0.0, bridge.nominal_nm2.max() / 1e9, *dots[:, resolved].flat)
+    cut = cut_height(highest, columns, *(() if before is None else (before,)))
+    places = bar_places(bridge.edges_m)
+    if before is not None:
+        places = bar_places(bridge.edges_m, *AFTER)
+        draw_baseline(axes, bar_places(bridge.edges_m, *BEFORE), before, cut, language)
+        highest = max(highest, float(before[2].max()))
     weak = () if bridge.comparison is None else bridge.comparison.weak
     draw_bars(
         axes,
@@ -133,24 +145,49 @@ def _draw_state(axes: Axes, bridge: BridgeView, language: Language) -> float:
     )
     colour = MUTED if bridge.is_doubtful else BAR_EDGE
     label = language.text("figure.interval")
-    draw_intervals(axes, places, low, high, colour=colour, label=label)
-    dots = _draw_crossings(axes, bridge, places, language)
-    tops = np.maximum(high, dots)
-    # Dots may be anywhere below their highest: a label there would cover them.
-    floor = np.where(dots > 0.0, 0.0, low)
-    label_bars(axes, places, floor, tops, _numbers(bridge, mean, language))
-    doubt = "?" if bridge.is_doubtful else ""
+    draw_intervals(axes, places, (low, high), colour=colour, label=label, cut=cut)
+    dots[dots > cut] = np.nan
+    _draw_crossings(axes, bridge, places, drawn, dots, language)
+    ends = np.minimum(high, cut)
+    highest = min(cut, max(highest, float(ends.max()), *dots[dots > 0.0]))
+    return _label(axes, bridge, places, (mean, low, ends), dots, highest, language)
+
+
+def _label(
+    axes: Axes,
+    bridge: BridgeView,
+    places: BarPlaces,
+    columns: tuple[Floats, Floats, Floats],
+    dots: Floats,
+    highest: float,
+    language: Language,
+) -> float:
+    """Write numbers, losses and names of elements; return the axis' end."""
+    mean, low, ends = columns
+    places, floor, tops = anchors_clear_of(axes, places, (low, ends), dots, 1.1 * highest)
+    label_values(axes, places, floor, tops, _numbers(bridge, mean, language))
     losses = {}
+    weak = () if bridge.comparison is None else bridge.comparison.weak
     if _meaning(bridge) == "ratio":  # otherwise the numbers themselves are the changes
         losses = {
-            element.number: language.text(
-                "figure.less", loss=100.0 * (1.0 - element.ratio), doubt=doubt
-            )
+            element.number: language.text("figure.less", loss=100.0 * (1.0 - element.ratio))
             for element in weak
         }
     label_losses(axes, places, floor, tops, losses)
-    highest = max(highest, float(tops.max()))
+    name_elements(axes, bridge.edges_m)
     return max(1.1 * highest, top_above_labels(axes, floor, tops, losses))
+
+
+def _columns(estimate: Estimate) -> tuple[Floats, Floats, Floats]:
+    """Return mean and limits in GN·m²."""
+    return estimate.mean / 1e9, estimate.low / 1e9, estimate.high / 1e9
+
+
+def _dots(drawn: list[CrossingView], elements: int) -> Floats:
+    """Return the estimates of single crossings in GN·m² (k, n); none of only one crossing."""
+    if len(drawn) < 2:
+        return np.zeros((0, elements))
+    return np.array([c.rigidity_nm2 for c in drawn], dtype=np.float64) / 1e9
 
 
 def _meaning(bridge: BridgeView) -> str:
@@ -166,36 +203,18 @@ def _numbers(bridge: BridgeView, mean: Floats, language: Language) -> list[str]:
     return [language.number(ratio, ".3f") for ratio in mean / (bridge.nominal_nm2 / 1e9)]
 
 
-def _draw_before(axes: Axes, bridge: BridgeView, places: BarPlaces, language: Language) -> float:
-    """Draw the baseline; return its highest value."""
-    assert bridge.baseline is not None  # noqa: S101 - its caller checked
-    mean, low, high = (column / 1e9 for column in bridge.baseline[:3])
-    axes.bar(
-        places.centres_m,
-        mean,
-        width=0.86 * places.lengths_m,
-        facecolor="white",
-        edgecolor=BASELINE_COLOUR,
-        linewidth=1.3,
-        zorder=2,
-        label=language.text("figure.before"),
-    )
-    draw_intervals(axes, places, low, high, colour=BASELINE_COLOUR, label="")
-    return float(high.max())
-
-
 def _draw_crossings(
-    axes: Axes, bridge: BridgeView, places: BarPlaces, language: Language
-) -> Floats:
-    """Draw the estimates of single crossings next to the interval; return the highest (n,)."""
-    drawn = [c for c in bridge.crossings if c.rigidity_nm2 is not None]
-    highest = np.zeros(places.centres_m.size)
-    if len(drawn) < 2:
-        return highest
+    axes: Axes,
+    bridge: BridgeView,
+    places: BarPlaces,
+    drawn: list[CrossingView],
+    dots: Floats,
+    language: Language,
+) -> None:
+    """Draw the estimates (k, n) of single crossings next to the interval."""
     named: set[str] = set()
-    for place, crossing in zip(np.linspace(-0.4, -0.26, len(drawn)), drawn, strict=True):
-        assert crossing.rigidity_nm2 is not None  # noqa: S101 - chosen by that
-        values = crossing.rigidity_nm2 / 1e9
+    shifts = np.linspace(-0.4, -0.26, len(dots))
+    for place, crossing, values in zip(shifts, drawn, dots, strict=False):
         kind = _kind_of(bridge, crossing)
         axes.plot(
             places.centres_m + place * places.lengths_m,
@@ -210,8 +229,6 @@ def _draw_crossings(
             label=None if kind in named else language.text(f"figure.crossing.{kind}"),
         )
         named.add(kind)
-        highest = np.maximum(highest, values)
-    return highest
 
 
 def _kind_of(bridge: BridgeView, crossing: CrossingView) -> str:

@@ -10,13 +10,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from services.common.language import ENGLISH, Language
-from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView
+from services.viewer.crossing_view import CrossingView
 from services.viewer.drawing import (
     LEFT,
     MUTED,
     NOMINAL_LINE,
     RIGHT,
     WIDTH_IN,
+    BarPlaces,
     add_ratio_axis,
     legend_beside_title,
     mark_bridge,
@@ -24,6 +25,7 @@ from services.viewer.drawing import (
     simplify_numbers,
     write_centred,
 )
+from services.viewer.element_labels import cut_height, draw_lines, end_with_names, name_elements
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000")
 """Okabe and Ito's; more crossings than these are all in the first."""
@@ -45,8 +47,8 @@ def draw_crossings(
     rigidity.set_title(language.text("figure.by_crossing"))
     rigidity.set_ylabel(language.text("figure.ei"))
     rigidity.stairs(nominal, bridge.element_edges_m, baseline=None, **NOMINAL_LINE)
-    highest = max(float(nominal.max()), _draw_intervals(rigidity, crossings, language))
-    rigidity.set_ylim(0.0, 1.08 * highest)
+    highest = _draw_intervals(rigidity, crossings, language)
+    rigidity.set_ylim(0.0, end_with_names(rigidity, 1.02 * highest))
     road.set_title(language.text("figure.road"))
     road.set_ylabel(language.text("figure.height"))
     _draw_roads(road, crossings, language)
@@ -57,18 +59,9 @@ def draw_crossings(
         mark_bridge(axes, (0.0, *bridge.interior_supports_m, bridge.span_m))
         axes.set_xlim(-0.03 * bridge.span_m, 1.03 * bridge.span_m)
     rigidity.set_xticks(bridge.element_edges_m, [])
-    for number, (start, end) in enumerate(
-        zip(bridge.element_edges_m, bridge.element_edges_m[1:], strict=False), start=1
-    ):
+    for end in bridge.element_edges_m[1:]:
         rigidity.axvline(end, color="#d5dade", linewidth=0.6, zorder=0.6)
-        rigidity.annotate(
-            f"$EI_{{{number}}}$",
-            ((start + end) / 2.0, 0.0),
-            xytext=(0, 5),
-            textcoords="offset points",
-            ha="center",
-            color=MUTED,
-        )
+    name_elements(rigidity, bridge.element_edges_m)
     add_ratio_axis(rigidity, nominal, language)
     road.set_xlabel(language.text("figure.chainage"))
     return figure
@@ -79,43 +72,53 @@ def _colour_of(place: int, count: int) -> str:
 
 
 def _label_of(place: int, crossings: Sequence[tuple[int, CrossingView]], language: Language) -> str:
-    """Return the label of a crossing; of many the first stands for all."""
+    """Return the label of a crossing; of many the first of each verdict stands for all."""
+    verdict = crossings[place][1].verdict
     if len(crossings) <= len(_COLOURS):
-        return language.text("figure.crossing_number", number=crossings[place][0])
-    if place:
+        label = language.text("figure.crossing_number", number=crossings[place][0])
+        return label if verdict == "good" else f"{label}, {language.text(verdict)}"
+    if verdict in [one.verdict for _, one in crossings[:place]]:
         return ""
+    if verdict != "good":
+        return language.text(f"figure.crossing.{verdict}")
     return language.text("figure.more", first=crossings[0][0], last=crossings[-1][0])
 
 
 def _draw_intervals(
     axes: Axes, crossings: Sequence[tuple[int, CrossingView]], language: Language
 ) -> float:
-    """Draw an interval for each crossing and element; return the highest value."""
-    highest = 0.0
-    edges = crossings[0][1].element_edges_m
-    lengths = np.diff(edges)
+    """Draw an interval for each crossing and element; return the highest value.
+
+    A suspect crossing has the open diamond of the bridge's figure, in its own colour.
+    """
+    edges, nominal = crossings[0][1].element_edges_m, crossings[0][1].nominal_nm2 / 1e9
+    highest = float(nominal.max())
     shifts = np.linspace(-0.34, 0.34, len(crossings)) if len(crossings) > 1 else np.zeros(1)
-    for place, (_, crossing) in enumerate(crossings):
-        if crossing.rigidity_nm2 is None or crossing.interval_nm2 is None:
-            continue
-        at = (edges[:-1] + edges[1:]) / 2.0 + shifts[place] * lengths
-        low, high = crossing.interval_nm2.T / 1e9
-        good = crossing.verdict == "good"
-        colour = _colour_of(place, len(crossings)) if good else VERDICT_COLOURS[crossing.verdict]
-        width = 2.2 if len(crossings) <= len(_COLOURS) else 1.2
-        axes.vlines(at, low, high, color=colour, linewidth=width, zorder=4)
+    columns = {
+        place: (one.rigidity_nm2 / 1e9, *(one.interval_nm2.T / 1e9))
+        for place, (_, one) in enumerate(crossings)
+        if one.rigidity_nm2 is not None and one.interval_nm2 is not None
+    }
+    cut = cut_height(highest, *columns.values())
+    width = 2.2 if len(crossings) <= len(_COLOURS) else 1.2
+    for place, (mean, low, high) in columns.items():
+        lengths = np.diff(edges)
+        places = BarPlaces((edges[:-1] + edges[1:]) / 2.0 + shifts[place] * lengths, lengths)
+        good = crossings[place][1].verdict == "good"
+        colour = _colour_of(place, len(crossings))
+        draw_lines(axes, places, (low, high), colour=colour, cut=cut, width=width)
         axes.plot(
-            at,
-            crossing.rigidity_nm2 / 1e9,
+            places.centres_m,
+            np.where(mean > cut, np.nan, mean),
             linestyle="none",
-            marker="o",
+            marker="o" if good else "D",
             markersize=4.2,
             color=colour,
             markerfacecolor=colour if good else "white",
             zorder=5,
             label=_label_of(place, crossings, language),
         )
-        highest = max(highest, float(high.max()), float(crossing.rigidity_nm2.max()) / 1e9)
+        highest = max(highest, float(np.minimum(np.maximum(high, mean), cut).max()))
     return highest
 
 

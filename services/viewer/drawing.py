@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,17 +43,6 @@ _NOTES = {
     "rejected": "this crossing has no usable values",
 }
 _SVG_METADATA = ("Date", "Creator", "Format", "Type")
-_PLATE: dict[str, Any] = {
-    "boxstyle": "round,pad=0.15",
-    "facecolor": "white",
-    "alpha": 0.85,
-    "linewidth": 0,
-}
-"""Box behind a label, which hides the lines that it would stand on."""
-_LABEL_PT = 16.0
-"""Height of a label with its box, in points."""
-_VALUE_PT, _LOSS_PT, _LOSS_ABOVE_VALUE_PT = 5.0, 6.0, 21.0
-"""Distances of labels from the top of an interval, in points."""
 _CHARACTERS = 118
 """Maximum length of a line of reasons between the figure's edges."""
 _BESIDE_VERDICT = 110
@@ -230,88 +219,6 @@ def draw_bars(
                     label=language.text(f"figure.{name}"),
                 )
             )
-
-
-def draw_intervals(
-    axes: Axes, places: BarPlaces, low: Floats, high: Floats, *, colour: str, label: str
-) -> None:
-    """Draw the interval of each element."""
-    centres, half = places.centres_m, 0.09 * places.lengths_m
-    axes.vlines(centres, low, high, color=colour, linewidth=2.2, zorder=5, label=label)
-    for end in (low, high):
-        axes.hlines(end, centres - half, centres + half, color=colour, zorder=5)
-
-
-def label_losses(
-    axes: Axes,
-    places: BarPlaces,
-    low: Floats,
-    high: Floats,
-    losses: Mapping[int, str],
-) -> None:
-    """Label the losses of elements, by their numbers, above their intervals and their values."""
-    above = _are_low(low, high)
-    for number, text in losses.items():
-        axes.annotate(
-            text,
-            (places.centres_m[number - 1], high[number - 1]),
-            xytext=(0, _LOSS_ABOVE_VALUE_PT if above[number - 1] else _LOSS_PT),
-            textcoords="offset points",
-            ha="center",
-            fontsize=8 if high.size > 11 else 9.5,
-            fontweight="bold",
-            zorder=8,
-            bbox=_PLATE,
-        )
-
-
-def label_bars(axes: Axes, places: BarPlaces, low: Floats, high: Floats, texts: list[str]) -> None:
-    """Write a number below each interval, or above where the bar is too low; and its name."""
-    small = 8.5 if len(texts) > 11 else 10.5
-    above = _are_low(low, high)
-    for number, (centre, text) in enumerate(zip(places.centres_m, texts, strict=True)):
-        axes.annotate(
-            text,
-            (centre, high[number] if above[number] else low[number]),
-            xytext=(0, _VALUE_PT if above[number] else -10),
-            textcoords="offset points",
-            ha="center",
-            va="bottom" if above[number] else "top",
-            fontsize=small,
-            fontweight="bold",
-            zorder=7,
-            bbox=_PLATE,
-        )
-        axes.annotate(
-            f"$EI_{{{number + 1}}}$",
-            (centre, 0.0),
-            xytext=(0, 5),
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            fontsize=small - 0.5,
-            color=MUTED,
-            zorder=7,
-        )
-
-
-def top_above_labels(axes: Axes, low: Floats, high: Floats, labelled: Iterable[int] = ()) -> float:
-    """Return the end of a vertical axis from 0 below which all labels above intervals stay.
-
-    `labelled` are the numbers of the elements with a loss above their interval.
-    """
-    above = np.array(_are_low(low, high))
-    needed_pt = np.where(above, _VALUE_PT + _LABEL_PT, 0.0)
-    for number in labelled:
-        start_pt = _LOSS_ABOVE_VALUE_PT if above[number - 1] else _LOSS_PT
-        needed_pt[number - 1] = start_pt + _LABEL_PT
-    height_pt = axes.get_window_extent().height * 72.0 / axes.figure.dpi
-    return float(np.max(high / (1.0 - needed_pt / height_pt)))
-
-
-def _are_low(low: Floats, high: Floats) -> Sequence[bool]:
-    """Return for each bar whether a number and a name do not fit below its interval."""
-    return [bool(one) for one in low < 0.36 * high.max()]
 
 
 def add_ratio_axis(axes: Axes, nominal: Floats, language: Language = ENGLISH) -> None:

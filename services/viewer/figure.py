@@ -37,16 +37,21 @@ from services.viewer.drawing import (
     add_ratio_axis,
     bar_places,
     draw_bars,
-    draw_intervals,
     draw_verdict,
-    label_bars,
-    label_losses,
     legend_beside_title,
     mark_bridge,
     simplify_axes,
-    top_above_labels,
     write_centred,
     write_figure,
+)
+from services.viewer.element_labels import (
+    cut_height,
+    draw_intervals,
+    end_with_names,
+    label_losses,
+    label_values,
+    name_elements,
+    top_above_labels,
 )
 
 HEIGHT_IN = 7.1
@@ -157,7 +162,8 @@ def _draw_rigidity(axes: Axes, crossing: CrossingView, truth: list[float] | None
     if crossing.rigidity_nm2 is None:
         _write_rejection(axes, crossing)
     else:
-        top = max(top, _draw_estimate(axes, crossing, crossing.rigidity_nm2 / 1e9))
+        estimate = _draw_estimate(axes, crossing, crossing.rigidity_nm2 / 1e9)
+        top = end_with_names(axes, max(top, estimate))
     axes.set_ylim(0.0, top)
     legend_beside_title(axes)
     add_ratio_axis(axes, nominal)
@@ -178,10 +184,12 @@ def _draw_estimate(axes: Axes, crossing: CrossingView, estimate: Floats) -> floa
         low, high = crossing.interval_nm2.T / 1e9
         colour = MUTED if doubtful else BAR_EDGE
         label = "95 % interval" if crossing.interval_has_meaning else "interval (without meaning)"
-        draw_intervals(axes, places, low, high, colour=colour, label=label)
-        lowest, upper = np.minimum(estimate, low), np.maximum(estimate, high)
+        cut = cut_height(crossing.nominal_nm2.max() / 1e9, (estimate, low, high))
+        draw_intervals(axes, places, (low, high), colour=colour, label=label, cut=cut)
+        lowest, upper = np.minimum(estimate, low), np.minimum(cut, np.maximum(estimate, high))
     ratios = estimate / (crossing.nominal_nm2 / 1e9)
-    label_bars(axes, places, lowest, upper, [f"{ratio:.3f}" for ratio in ratios])
+    label_values(axes, places, lowest, upper, [f"{ratio:.3f}" for ratio in ratios])
+    name_elements(axes, edges)
     losses = {one.number: f"{100.0 * (1.0 - one.ratio):.0f} % less" for one in weak}
     label_losses(axes, places, lowest, upper, losses)
     return max(1.1 * float(upper.max()), top_above_labels(axes, lowest, upper, losses))

@@ -407,7 +407,7 @@ def test_glossary_ignores_names_within_the_markup(site: Site) -> None:
 @pytest.mark.parametrize("code", LANGUAGES)
 def test_figure_has_numbers_of_one_meaning(site: Site, then: Path, code: str) -> None:
     language = language_of(code)
-    loss = language.text("figure.less", loss=30.0, doubt="").partition(" % ")[2]
+    loss = language.text("figure.less", loss=30.0).partition(" % ")[2]
     for baseline, meaning in ((None, "ratio"), (then, "change")):
         files = [(Path("now.json"), changed(site, 0.7), site)]
         (report,) = bridge_reports(files, baseline, language=language)
