@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 
 from services.common.arrays import Floats
 from services.common.language import ENGLISH, Language
-from services.identification.comparison import Estimate
 from services.viewer.bridge_view import BridgeView, summary_of_bridge
 from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView
 from services.viewer.drawing import (
+    ABOVE_LEGEND_PT,
     BANNERS,
     BAR_EDGE,
     INK,
@@ -43,6 +43,7 @@ from services.viewer.element_labels import (
     AFTER,
     BEFORE,
     anchors_clear_of,
+    columns_gnm2,
     cut_height,
     draw_baseline,
     draw_intervals,
@@ -54,8 +55,6 @@ from services.viewer.element_labels import (
 )
 
 _MAX_LISTED = 12
-_ABOVE_LEGEND_PT = 22.0
-"""Distance of the title from the panel, with the legend between them, in points."""
 _SIGNS = {"good": "●", "unused": "○", "suspect": "◇", "rejected": "×"}
 """Signs of good crossings, of unused good ones, and of the other verdicts, without colour."""
 _MARKERS = {"suspect": "D", "rejected": "X"}
@@ -109,7 +108,7 @@ def _draw_panel(axes: Axes, bridge: BridgeView, language: Language) -> None:
     title = language.text("figure.rigidity")
     if bridge.estimate is not None:
         title += f" {language.text(f'figure.numbers_{_meaning(bridge)}')}"
-    axes.set_title(title, pad=_ABOVE_LEGEND_PT)
+    axes.set_title(title, pad=ABOVE_LEGEND_PT)
     simplify_axes(axes)
     simplify_numbers(axes, language)
     if _meaning(bridge) == "ratio":
@@ -121,8 +120,8 @@ def _draw_panel(axes: Axes, bridge: BridgeView, language: Language) -> None:
 def _draw_state(axes: Axes, bridge: BridgeView, language: Language) -> float:
     """Draw the state, the baseline next to it and single crossings; return the axis' end."""
     assert bridge.estimate is not None  # noqa: S101 - its caller checked
-    mean, low, high = columns = _columns(bridge.estimate)
-    before = None if bridge.baseline is None else _columns(bridge.baseline)
+    mean, low, high = columns = columns_gnm2(bridge.estimate)
+    before = None if bridge.baseline is None else columns_gnm2(bridge.baseline)
     drawn = [c for c in bridge.crossings if c.rigidity_nm2 is not None]
     dots = _dots(drawn, mean.size)
     resolved = [n for n in range(mean.size) if n + 1 not in bridge.unresolved]
@@ -176,11 +175,6 @@ def _label(
     label_losses(axes, places, floor, tops, losses)
     name_elements(axes, bridge.edges_m)
     return max(1.1 * highest, top_above_labels(axes, floor, tops, losses))
-
-
-def _columns(estimate: Estimate) -> tuple[Floats, Floats, Floats]:
-    """Return mean and limits in GN·m²."""
-    return estimate.mean / 1e9, estimate.low / 1e9, estimate.high / 1e9
 
 
 def _dots(drawn: list[CrossingView], elements: int) -> Floats:

@@ -48,6 +48,8 @@ _CHARACTERS = 118
 _BESIDE_VERDICT = 110
 """Maximum length of a finding next to the word of a good verdict."""
 _OMITTED = " …"
+ABOVE_LEGEND_PT = 22.0
+"""Distance of the title from the panel, with the legend between them, in points."""
 
 NOMINAL_LINE: dict[str, Any] = {"color": MUTED, "linewidth": 1.0, "linestyle": (0, (4, 3))}
 BASELINE_COLOUR = VERDICT_COLOURS["good"]

@@ -13,6 +13,7 @@ from pre_core.constants import NORMAL_975
 from schemas.results import RESOLVED
 from services.common.arrays import Floats
 from services.common.language import ENGLISH, Language
+from services.identification.comparison import Estimate
 from services.viewer.drawing import BASELINE_COLOUR, MUTED, BarPlaces
 
 _PLATE: dict[str, Any] = {
@@ -39,6 +40,11 @@ _LONG = 2.5
 """Length of an interval from which it is cut, relative to the highest resolved value."""
 _CUT = 1.6
 """Length of a cut interval, relative to the highest resolved value."""
+
+
+def columns_gnm2(estimate: Estimate) -> tuple[Floats, Floats, Floats]:
+    """Return mean and limits in GN·m²."""
+    return estimate.mean / 1e9, estimate.low / 1e9, estimate.high / 1e9
 
 
 def cut_height(highest: float, *intervals: tuple[Floats, Floats, Floats]) -> float:

@@ -16,6 +16,7 @@ from schemas.reasons import Reason
 from schemas.results import RoadResult
 from services.common.arrays import Floats
 from services.common.language import ENGLISH
+from services.identification.comparison import Comparison, Estimate
 from services.identification.result_parts import detrended
 from services.viewer.crossing_view import (
     VEHICLE_COLOURS,
@@ -25,6 +26,7 @@ from services.viewer.crossing_view import (
     summary_line,
 )
 from services.viewer.drawing import (
+    ABOVE_LEGEND_PT,
     BAR_EDGE,
     INK,
     LEFT,
@@ -45,7 +47,11 @@ from services.viewer.drawing import (
     write_figure,
 )
 from services.viewer.element_labels import (
+    AFTER,
+    BEFORE,
+    columns_gnm2,
     cut_height,
+    draw_baseline,
     draw_intervals,
     end_with_names,
     label_losses,
@@ -59,6 +65,7 @@ _ERROR = "mean − truth, without offset and tilt"
 _HEIGHT_WITHOUT_ROAD_IN = 4.4
 _HEADING_IN, _BANNER_IN = 1.17, 0.36
 """Height of the heading above the first panel, and of a banner in addition."""
+_LEGEND_IN = 0.21
 
 
 def crossing_figure(
@@ -67,15 +74,18 @@ def crossing_figure(
     crossing: CrossingView,
     element_truth: list[float] | None = None,
     road_truth: tuple[Floats, Floats] | None = None,
+    baseline: Estimate | None = None,
 ) -> None:
     """Draw one crossing into a PNG or SVG file; an existing file is replaced.
 
     `element_truth` is the true rigidity of each element as a ratio to the nominal value;
     `road_truth` the true profile as chainage and height in metres. Both are known only for
-    simulated crossings.
+    simulated crossings. With a `baseline` the elements are compared with it.
     """
     with matplotlib.rc_context(STYLE):
-        figure = draw_crossing(crossing, element_truth=element_truth, road_truth=road_truth)
+        figure = draw_crossing(
+            crossing, element_truth=element_truth, road_truth=road_truth, baseline=baseline
+        )
     write_figure(path, figure)
 
 
@@ -95,6 +105,7 @@ def draw_crossing(
     *,
     element_truth: list[float] | None,
     road_truth: tuple[Floats, Floats] | None,
+    baseline: Estimate | None = None,
 ) -> Figure:
     """Return the figure, to be drawn in `STYLE`."""
     has_road = crossing.road is not None or road_truth is not None
@@ -102,6 +113,8 @@ def draw_crossing(
     heading_in = _HEADING_IN
     if crossing.verdict != "good":  # the banner has two lines
         height_in, heading_in = height_in + _BANNER_IN, heading_in + _BANNER_IN
+    if _is_change(comparison_of(crossing, baseline)):  # the title is above the legend
+        height_in, heading_in = height_in + _LEGEND_IN, heading_in + _LEGEND_IN
     figure = Figure(figsize=(WIDTH_IN, height_in), facecolor="white")
     FigureCanvasAgg(figure)
     ratios = (3.0, 2.0, 1.15) if has_road else (1.0,)
@@ -118,8 +131,8 @@ def draw_crossing(
     rigidity = figure.add_subplot(grid[0])
     panels = [rigidity]
     panels += [figure.add_subplot(grid[n], sharex=rigidity) for n in range(1, len(ratios))]
-    _draw_heading(figure, crossing)
-    _draw_rigidity(rigidity, crossing, element_truth)
+    _draw_heading(figure, crossing, baseline)
+    _draw_rigidity(rigidity, crossing, element_truth, baseline)
     if has_road:
         _draw_profiles(panels[1], crossing, road_truth)
         _draw_differences(panels[2], crossing, road_truth)
@@ -133,7 +146,7 @@ def draw_crossing(
     return figure
 
 
-def _draw_heading(figure: Figure, crossing: CrossingView) -> None:
+def _draw_heading(figure: Figure, crossing: CrossingView, baseline: Estimate | None) -> None:
     inch = 1.0 / figure.get_figheight()
     title = "Stiffness and road profile from one crossing alone (not fused)"
     figure.text(LEFT, 1.0 - 0.18 * inch, title, fontsize=14, fontweight="bold", va="top")
@@ -141,15 +154,22 @@ def _draw_heading(figure: Figure, crossing: CrossingView) -> None:
     small: dict[str, Any] = {"fontsize": 9.5, "color": MUTED, "va": "top"}
     figure.text(LEFT, 1.0 - 0.455 * inch, summary, parse_math=False, **small)
     reasons = crossing.reason_texts
-    sentences = describe_crossing(crossing, comparison_of(crossing))
+    sentences = describe_crossing(crossing, comparison_of(crossing, baseline))
     draw_verdict(figure, crossing.verdict, reasons, 1.0 - 0.65 * inch, sentences)
 
 
-def _draw_rigidity(axes: Axes, crossing: CrossingView, truth: list[float] | None) -> None:
+def _draw_rigidity(
+    axes: Axes, crossing: CrossingView, truth: list[float] | None, baseline: Estimate | None
+) -> None:
     edges = crossing.element_edges_m
     nominal = crossing.nominal_nm2 / 1e9
     centres = (edges[:-1] + edges[1:]) / 2.0
-    axes.set_title("Flexural rigidity EI")
+    found = comparison_of(crossing, baseline)
+    is_change = _is_change(found)
+    axes.set_title(ENGLISH.text("figure.rigidity"))
+    if is_change:
+        numbers = ENGLISH.text("figure.numbers_change")
+        axes.set_title(f"{axes.get_title('left')} {numbers}", pad=ABOVE_LEGEND_PT)
     axes.set_ylabel("EI (GN·m²)")
     axes.stairs(nominal, edges, baseline=None, label="nominal", **NOMINAL_LINE)
     top = 1.1 * float(nominal.max())
@@ -162,37 +182,53 @@ def _draw_rigidity(axes: Axes, crossing: CrossingView, truth: list[float] | None
     if crossing.rigidity_nm2 is None:
         _write_rejection(axes, crossing)
     else:
-        estimate = _draw_estimate(axes, crossing, crossing.rigidity_nm2 / 1e9)
-        top = end_with_names(axes, max(top, estimate))
+        highest = _draw_estimate(axes, crossing, found, baseline if is_change else None)
+        top = end_with_names(axes, max(top, highest))
     axes.set_ylim(0.0, top)
     legend_beside_title(axes)
-    add_ratio_axis(axes, nominal)
+    if not is_change:
+        add_ratio_axis(axes, nominal)
 
 
-def _draw_estimate(axes: Axes, crossing: CrossingView, estimate: Floats) -> float:
+def _is_change(found: Comparison | None) -> bool:
+    return found is not None and found.reference == "baseline"
+
+
+def _draw_estimate(
+    axes: Axes, crossing: CrossingView, found: Comparison | None, baseline: Estimate | None
+) -> float:
     """Draw bars, intervals and labels in GN·m²; return the end of the vertical axis."""
-    edges = crossing.element_edges_m
-    doubtful = crossing.verdict != "good" or not crossing.interval_has_meaning
-    compared = comparison_of(crossing)
-    weak = () if compared is None or doubtful else compared.weak
-    numbers = {one.number for one in weak}
-    open_ones = crossing.unresolved
-    places = bar_places(edges)
-    draw_bars(axes, places, estimate, numbers, doubtful=doubtful, unresolved=open_ones)
-    lowest, upper = estimate, estimate
+    assert crossing.rigidity_nm2 is not None  # noqa: S101 - its caller checked
+    edges, estimate = crossing.element_edges_m, crossing.rigidity_nm2 / 1e9
+    weak = () if found is None or crossing.is_doubtful else found.weak
+    low, high, cut = estimate, estimate, np.inf
+    before = None if baseline is None else columns_gnm2(baseline)
     if crossing.interval_nm2 is not None:
         low, high = crossing.interval_nm2.T / 1e9
+        drawn = [(estimate, low, high)] + ([] if before is None else [before])
+        cut = cut_height(crossing.nominal_nm2.max() / 1e9, *drawn)
+    places, highest = bar_places(edges), 0.0
+    if before is not None:
+        draw_baseline(axes, bar_places(edges, *BEFORE), before, cut)
+        places, highest = bar_places(edges, *AFTER), min(cut, float(before[2].max()))
+    numbers = {one.number for one in weak}
+    doubtful, open_ones = crossing.is_doubtful, crossing.unresolved
+    draw_bars(axes, places, estimate, numbers, doubtful=doubtful, unresolved=open_ones)
+    if crossing.interval_nm2 is not None:
         colour = MUTED if doubtful else BAR_EDGE
         label = "95 % interval" if crossing.interval_has_meaning else "interval (without meaning)"
-        cut = cut_height(crossing.nominal_nm2.max() / 1e9, (estimate, low, high))
         draw_intervals(axes, places, (low, high), colour=colour, label=label, cut=cut)
-        lowest, upper = np.minimum(estimate, low), np.minimum(cut, np.maximum(estimate, high))
-    ratios = estimate / (crossing.nominal_nm2 / 1e9)
-    label_values(axes, places, lowest, upper, [f"{ratio:.3f}" for ratio in ratios])
+    lowest, upper = np.minimum(estimate, low), np.minimum(cut, np.maximum(estimate, high))
+    if before is None or found is None:
+        texts = [f"{ratio:.3f}" for ratio in estimate / (crossing.nominal_nm2 / 1e9)]
+        losses = {one.number: f"{100.0 * (1.0 - one.ratio):.0f} % less" for one in weak}
+    else:  # the numbers themselves are the changes
+        texts, losses = [ENGLISH.change(one.ratio) for one in found.elements], {}
+    label_values(axes, places, lowest, upper, texts)
     name_elements(axes, edges)
-    losses = {one.number: f"{100.0 * (1.0 - one.ratio):.0f} % less" for one in weak}
     label_losses(axes, places, lowest, upper, losses)
-    return max(1.1 * float(upper.max()), top_above_labels(axes, lowest, upper, losses))
+    highest = max(highest, float(upper.max()))
+    return max(1.1 * highest, top_above_labels(axes, lowest, upper, losses))
 
 
 def _draw_profiles(axes: Axes, crossing: CrossingView, truth: tuple[Floats, Floats] | None) -> None:

@@ -142,3 +142,24 @@ def test_suspect_crossing_has_one_sign_in_all_figures(site: Site) -> None:
     assert legend(axes) == ["No. 1", "No. 2, suspect"]
     many = [(n, view.crossings[n % 2]) for n in range(10)]
     assert legend(draw_crossings(many).axes[0]) == ["No. 0 to 9", "suspect crossing"]
+
+
+@pytest.mark.parametrize("verdict", ["good", "suspect"])
+def test_crossing_is_compared_with_the_baseline_like_its_bridge(site: Site, verdict: str) -> None:
+    bridge, reasons = site.bridges[0], () if verdict == "good" else ("position_outage",)
+    given = some_crossing("a", verdict=verdict, reasons=reasons)
+    view = view_of_crossing(results_of(site, given).crossings[0], bridge)
+    sound = view_of_bridge(
+        bridge, results_of(site, some_crossing("z"), used="z", ratios=np.ones(7)), None
+    )
+    figure = draw_crossing(view, element_truth=None, road_truth=None, baseline=sound.estimate)
+    axes = figure.axes[0]
+    assert "numbers: change from the baseline" in axes.get_title("left")
+    assert "baseline" in legend(axes)
+    texts = [text.get_text() for text in axes.texts]
+    assert "−60 %" in texts
+    assert not any(text.endswith("less") for text in texts)
+    written = "\n".join(text.get_text() for text in figure.texts)
+    said = "Element 4, 12.9 to 17.1 m: 60 % less stiff than the baseline" in written
+    assert said == (verdict == "good")
+    assert_words_apart(figure)
