@@ -37,7 +37,7 @@ def health_command(
     """Return a line on the health of a service, with its own note, if any.
 
     InputError: a bad realm or name. FailureError: no router answers, the service sends nothing, has
-    sent nothing for `OLDEST_S`, or declares itself unhealthy.
+    sent nothing for `OLDEST_S`, has ended, or declares itself unhealthy.
     """
     try:
         where = key(check_realm(realm), "service", check_identifier(service), "health")
@@ -55,6 +55,8 @@ def health_command(
         else:
             hint = silence_hint(where, tls)
         raise FailureError(f"{service} in realm {realm} sends nothing at {endpoint}; {hint}")
+    if latest.ended:
+        raise FailureError(f"{service} in realm {realm} has ended")
     age_s = time.time() - latest.time_ns * 1e-9
     if age_s > OLDEST_S:
         raise FailureError(f"{service} in realm {realm} has sent nothing for {age_s:.0f} s")

@@ -48,6 +48,17 @@ def test_silence_with_credentials_of_a_truck_names_its_role(
         )
 
 
+def test_service_that_has_ended_is_not_well(endpoint: str) -> None:
+    with open_session(listen=endpoint) as session:
+        publisher = Publisher(session, "live")
+        sent = pb.Health(schema_version=1, service="logger", ok=True, ended=True)
+        sent.time_ns = time.time_ns()
+        publisher.put("service", "logger", "health", sent.SerializeToString())
+        with pytest.raises(FailureError, match="logger in realm live has ended"):
+            health_command(service="logger", endpoint=endpoint, tls=None, realm="live")
+        publisher.close()
+
+
 def test_clock_of_a_service_that_is_ahead_is_reported(endpoint: str) -> None:
     with open_session(listen=endpoint) as session:
         publisher = Publisher(session, "live")
