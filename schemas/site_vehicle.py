@@ -143,6 +143,14 @@ class Vehicle(WithSpreads):
         return 0.0 if tandem is None else tandem.share_spread
 
     @property
+    def has_equal_single_tyres(self) -> bool:
+        """Whether both axles have the same single tyres, as far as their sizes are declared."""
+        pairs = (self.tyre_width_m, self.tyre_contact_length_m, self.track_m)
+        return self.twin_tyre_distance_m == (0.0, 0.0) and all(
+            pair is None or pair[0] == pair[1] for pair in pairs
+        )
+
+    @property
     def channels(self) -> tuple[str, ...]:
         """Names of the accelerometers."""
         return tuple(one.channel for one in self.sensors) or CHANNELS

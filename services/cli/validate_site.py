@@ -21,8 +21,8 @@ from services.common.files import check_writable, make_folder
 from services.common.language import ENGLISH
 from services.common.naming import count_of, processes_in_words
 from services.common.progress import progress_bar, start_line
+from services.common.truck_choice import truck_to_try
 from services.history.validation_files import save
-from services.identification.footprints import truck_to_try
 from services.simulation.validation_options import CertificateOptions
 from services.simulation.validation_trial import (
     CROSSINGS,

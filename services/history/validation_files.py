@@ -20,7 +20,7 @@ from schemas.validation_records import (
 from services.common.errors import InputError
 from services.common.files import make_folder, write_atomically
 from services.common.language import ENGLISH, Language
-from services.identification.footprints import truck_to_try
+from services.common.truck_choice import truck_to_try
 
 _log = logging.getLogger(__name__)
 

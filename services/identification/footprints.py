@@ -38,22 +38,6 @@ def footprints_of(
     return axles[0], axles[1]._replace(offset_m=vehicle.rear_axle_offset_m or 0.0)
 
 
-def has_equal_tyres(vehicle: Vehicle) -> bool:
-    """Return whether both compared axles have the same tyres and track, as far as declared."""
-    front, rear = footprints_of(vehicle)
-    return rear._replace(offset_m=front.offset_m) == front
-
-
-def truck_to_try(vehicle: Vehicle) -> str:
-    """Return the key of the sentence part that names a better truck: `unlike`, `single`, `tandem`.
-
-    Equal single tyres improve on unlike ones, an equalised tandem on both.
-    """
-    if vehicle.tandem is not None:
-        return "tandem"
-    return "single" if has_equal_tyres(vehicle) else "unlike"
-
-
 def lead_footprint_of(vehicle: Vehicle) -> Footprint:
     """Return the footprint of the axle ahead of a tandem, with that of the tandem's first one.
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from schemas.results import CrossingResult
 from services.common.language import Language, utc_day
-from services.identification.footprints import truck_to_try
+from services.common.truck_choice import truck_to_try
 from services.report.bridge import BridgeReport, still_weak
 from services.report.cautions import named_elements, possibly_weak, weak_before
 from services.report.place import position_of

@@ -85,7 +85,6 @@ NOT_RUN = {
     "driveby fuse week.json lastweek.json --json both.json": FUSES,
     "driveby fuse both.json --baseline lastyear.json": FUSES,
     "pytest tests/numerics/test_fusion.py": ITSELF,
-    "pytest tests/unit/inspection": ITSELF,
     "driveby validate --method pre --surveys 15": LONG,
     "driveby validate --method pre --surveys 15 --records build/surveys.jsonl": LONG,
     "driveby validate --method pre --surveys 3 --kinds scenario-1,scenario-4,scenario-10 "

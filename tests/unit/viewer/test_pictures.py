@@ -219,10 +219,14 @@ def test_identify_draws_the_baseline_that_it_compares_with(
     assert cli.main(command) == 0
     svg = (folder / "bridge-1.svg").read_text()
     assert "<!-- baseline -->" in svg
+    assert "<!-- Flexural rigidity EI (numbers: change from the baseline) -->" in svg
+
+
+def test_picture_of_a_crossing_shows_the_baseline_of_its_bridge(site: Site, tmp_path: Path) -> None:
+    results = results_of(site, some_crossing("a"), used="a")
+    write_pictures(tmp_path, results, site, baselines=results.bridges)
     title = "<!-- Flexural rigidity EI (numbers: change from the baseline) -->"
-    assert title in svg
-    (crossing,) = folder.glob("truck-1.*.svg")
-    assert title in crossing.read_text()
+    assert title in (tmp_path / "a.svg").read_text()
 
 
 def test_picture_names_an_element_that_was_weak_in_its_baseline(site: Site) -> None:
