@@ -40,11 +40,11 @@ class ImportOptions:
         metavar="NAME",
     )
     preview: bool = flag(
-        "print the guesses, the first rows and the curves as understood, and write nothing",
+        "print the guesses, the first rows and the curves as interpreted, and write nothing",
         group=_TABLES,
     )
     picture: Path | None = output_option(
-        "picture of the first run as understood; writes no recording",
+        "picture of the first run as interpreted; writes no recording",
         "OUT.png",
         PNG,
         group=_TABLES,

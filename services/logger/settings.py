@@ -31,7 +31,7 @@ class LoggerSettings:
     listen: str | None = opt(f"address to listen on (default: {DEFAULT_ENDPOINT})")
     tls: Path | None = tls_option()
     insecure: bool = flag(
-        "listen to other machines without --tls; any session that reaches the address is accepted"
+        "accept other machines without --tls; any session that reaches the address is accepted"
     )
     folder: Path = folder_option("folder of the recordings")
     file: Path | None = output_option("single new file for all messages", "REC.mcap")
@@ -59,7 +59,8 @@ class LoggerSettings:
         metavar="MB",
     )
     min_free: float = opt(
-        "minimum free disk space in MB; recording stops at one eighth of it (default: 500)",
+        "least free disk space in MB for a start; below it health is not ok, below an eighth of it"
+        " recording stops (default: 500)",
         number("a size in MB", low=0, high=1e9),
         group=_ROOM,
         default=500.0,

@@ -175,7 +175,8 @@ class SimulateOptions:
         metavar="START:END",
     )
     departed_vehicle: tuple[float, float, float] | None = opt(
-        "weight and speed of a vehicle that left S seconds before the truck entered",
+        "weight in N and speed in m/s of a vehicle that left the bridge S seconds before the truck"
+        " entered it",
         numbers(
             "a weight in N, a speed in m/s and seconds before (N:M_PER_S:S)",
             (0, 1e7),
