@@ -19,7 +19,7 @@ from tests.unit.viewer.found import results_of, some_crossing
 PAIR = VehicleBridgePair("truck-1", "bridge-1")
 UNTRIED = (
     "No site validation of truck-1 on this bridge: whether the intervals contain the truth has not "
-    "been tried. Run driveby validate --site site.toml."
+    "been tested. Run driveby validate --site site.toml."
 )
 
 

@@ -78,7 +78,7 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     )
     assert "“Clearly less stiff” means that the whole 95 % interval lies more than 10 %" in text
     assert "Look there for cracks" in text
-    assert "How soon is for the engineer to decide" in text
+    assert "The engineer decides how soon" in text
     assert (
         "Bridge 30 m, 7 elements, counted from the south-west end (36.11060° N, 140.10100° E)"
         in text
@@ -114,14 +114,14 @@ def test_measures_name_the_criterion_of_weighted_draws(site: Site) -> None:
     one = known.model_copy(update={"diagnostics": {**known.diagnostics, "pareto_k": 0.719}})
     (added,) = set(measures_of(one, ENGLISH)) - set(measures_of(known, ENGLISH))
     assert (added.name, added.value) == ("pareto_k", "0.719")
-    assert ENGLISH.text("meaning.pareto_k").endswith("at most 0.7 is needed")
+    assert ENGLISH.text("meaning.pareto_k").endswith("must be at most 0.7")
 
 
 def test_measures_of_many_crossings_keep_their_meanings_readable(site: Site) -> None:
     """A column of its own would be some letters wide beside six crossings."""
     many = [some_crossing(name, entry=60.0 * n) for n, name in enumerate("abcdef")]
     text = reported(site, results_of(site, *many, used="f")).text
-    assert "R-hat agreement of parts of the draws; below 1.05 is needed 1.004 1.004" in text
+    assert "R-hat agreement between chains of draws; must be below 1.05 1.004 1.004" in text
     assert "Meaning" not in text
     assert "Meaning" in reported(site, results_of(site, *many[:3], used="c")).text
 
