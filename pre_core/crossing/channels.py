@@ -131,10 +131,10 @@ def _interpolated(samples: FloatArray, times: int) -> tuple[FloatArray, int]:
 
 
 def interpolate_at(samples: FloatArray, place: FloatArray) -> FloatArray:
-    """Return samples (n,) at `place` (m,), in samples from the first, by a windowed sinc.
+    """Return values (m,) of samples (n,) at `place` (m,), in steps from the first, by a sinc.
 
-    Frequencies below 0.45 of the rate are unchanged. NaN without enough samples on both sides
-    (`INTERPOLATION_REACH`).
+    The sinc is windowed; frequencies below 0.45 of the rate are unchanged. Values without enough
+    samples on both sides (`INTERPOLATION_REACH`) are NaN.
     """
     beta = kaiser_beta(_STOP_BAND_DB)
     below = np.floor(place).astype(np.int64)

@@ -95,8 +95,8 @@ def correlation(
 ) -> float:
     """Return E[r' C_0^-1 r_k] per residual sample by the mismatch alone.
 
-    With r the residuals of the first truck and r_k those of `truck`, `gain` (4,) and `delay_s`
-    (4,) those of its channels.
+    Here r are the residuals of the first truck and r_k those of `truck`; `gain` (4,) and `delay_s`
+    (4,) are those of its channels.
     """
     equations = _equations(of, truck) * channel_factors(of.omega, gain, delay_s)
     return float(np.vdot(of.weight.conj(), equations).real)
@@ -128,8 +128,8 @@ def mismatch_power(
 ) -> FloatArray:
     """Return E[r' C_0^-1 (r_k - r)] per residual sample by the mismatch alone: (trucks - 1,).
 
-    With r the residuals of the first truck and r_k those of another, each with its `channels`;
-    the others are those of `mismatch_weights`.
+    Here r are the residuals of the first truck and r_k those of another, each with its `channels`;
+    the other arguments are as in `mismatch_weights`.
     """
     of = mismatch_weights(rows, trucks[0], channels, density, force, stretch)
     found = [

@@ -4,7 +4,8 @@ Noise that is whitened for one truck has other expected squares for another (`po
 `errors_in_variables`), and so biases towards trucks that transmit less. A search subtracts the
 tangent of these squares at its own truck. Draws go further: the loads on both axles and the
 stiffness of their springs may together be a third off, where the squares are far from their
-tangent. Extrapolated, it made bridges that fit 100 times their noise worse, e^90 times likelier.
+tangent. The extrapolated tangent made bridges whose fit is worse by 100 times the noise e^90 times
+likelier.
 """
 
 from typing import NamedTuple

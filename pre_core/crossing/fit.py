@@ -205,7 +205,7 @@ def is_accepted(problem: PosteriorProblem, chi2: float) -> bool:
 
 
 def is_better_misfit(chi2: float, last: float) -> bool:
-    """Return whether a fit of this chi2 is worth another one after a fit of chi2 `last`."""
+    """Return whether another fit is worthwhile after one that lowered chi2 from `last` to this."""
     return chi2 <= max(_CLEAR_MISFIT_CHI2, (1.0 - SMALL_IMPROVEMENT) * last)
 
 

@@ -161,7 +161,7 @@ def with_axle_roll(shapes: MismatchSpectra, hop_hz: float, speed_m_per_s: float)
 
     A sensor beside the middle of its axle reads a part of the roll, by which an offset's spectrum
     rises at the axle's roll resonance, `_ROLL_BANDS` relative to the frequency `hop_hz` of its mass
-    on its tyres. A band is a hat over the logarithm of the frequency.
+    on its tyres. A band is a hat function of the logarithm of the frequency.
     """
     n = shapes.cycles_per_m
     at = np.log(np.maximum(n, n[1]) * speed_m_per_s / hop_hz)
@@ -239,8 +239,8 @@ def density_at(mismatch: Mismatch, omega: FloatArray, table: FloatArray) -> Floa
 def unwindowed(shapes: MismatchSpectra) -> FloatArray:
     """Return the spectra (s, g) of d before windowing.
 
-    What is not a covariance to whiten with needs no window, and its fill of the zero at the contact
-    length makes levels 5 % too low.
+    Only a covariance that whitens needs the window; elsewhere it would fill the zero of a spectrum
+    at the contact length, which makes levels 5 % too low.
     """
     return shapes.front_cross_spectrum_density - shapes.rear_cross_spectrum_density
 

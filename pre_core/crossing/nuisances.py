@@ -1,17 +1,18 @@
 """Residuals of a crossing with its nuisances integrated out: truck, trajectory, sensors.
 
-They are determined by residuals so exact that no weighted draw of all coordinates would ever be
-likely; given the bridge they are normal. So residuals are evaluated with nuisances that follow the
-bridge, and projected on what no nuisance explains. They follow it linearly, and on demand
-by one step of Gauss-Newton for each bridge: without it, a bridge metres from the optimum's offset
-would be free to move the truck to where its residuals are not linear, and fit better than any.
+The residuals determine the nuisances so exactly that no weighted draw of all coordinates would ever
+be likely; given the bridge they are normal. So residuals are evaluated with nuisances that follow
+the bridge, and projected on what no nuisance explains. They follow it linearly, and on demand by
+one step of Gauss-Newton for each bridge: without it, a bridge metres from the optimum's offset
+would be free to move the truck to where its residuals are not linear, and fit better than any
+other.
 
 The vibration before the crossing is a wave of the bridge's own frequency, which moves with the
 bridge: removed at the frequency of the optimum it would leave, or take, a wave in the residuals of
 any other bridge. So it is noise here, in the mixture of its waves on the bridges of many points.
 
 A truck that follows a bridge far from the optimum also changes the expected squares of the noise
-(`expected_squares`). What the priors' tangent lacks of them is a residual of its own.
+(`expected_squares`). The priors contain their tangent; the deviation from it is one more residual.
 """
 
 from typing import NamedTuple

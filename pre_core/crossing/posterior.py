@@ -110,12 +110,12 @@ class PosteriorProblem(NamedTuple):
 
 
 def has_tandem(problem: PosteriorProblem) -> bool:
-    """Return whether a tandem's axles are compared, without equations of the body."""
+    """Return whether a tandem's axles are compared; the body then has no equations."""
     return problem.crossing.lead.ahead_m > 0.0
 
 
 def layout(problem: PosteriorProblem) -> ParameterLayout:
-    """Return the layout: theta, wheelbase, gains, delays, initial states, swing, trajectory."""
+    """Return the layout: truck and bridge, channels, initial vibration, and trajectory."""
     priors = problem.priors
     return parameter_layout(
         priors.estimated.tobytes(), priors.half_normal.tobytes(), problem.basis_position.shape[1]
@@ -311,8 +311,8 @@ def all_rows(problem: PosteriorProblem, y: FloatArray, temperature: float = 1.0)
 def log_odds_of_absence(problem: PosteriorProblem, inflation: float = 1.0) -> FloatArray:
     """Return the log ratio (size,) of the point mass at zero to the prior density at zero.
 
-    For noise `inflation` times as large, with a prior as much wider; minus infinity without
-    absence.
+    The noise is `inflation` times as large and the prior as much wider. The ratio is minus infinity
+    for coordinates that cannot be absent.
     """
     where, priors = layout(problem), problem.priors
     odds = np.full(where.size, -np.inf)

@@ -1,4 +1,4 @@
-"""Method `pre`: from one crossing's signals to the problem to solve, and its noise."""
+"""Preparation of one crossing for method `pre`: the problem to solve, and its noise."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

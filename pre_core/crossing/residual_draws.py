@@ -1,6 +1,6 @@
 """Posterior draws by the residuals themselves, proposed by surfaces of them.
 
-Alike tyres show a bridge so sharply that a surface fitted once is off by more than the posterior's
+With alike tyres the posterior is so narrow that a surface fitted once is off by more than its
 width. So draws on a surface (`search.tempering`) are weighted by the residuals there, to which the
 surface is then fitted too, until the weights hardly vary. All draws are weighted as of the mixture
 of the surfaces (adaptive multiple importance sampling: Cornuet, Marin, Mira and Robert 2012).
@@ -89,7 +89,7 @@ def residual_draws(
 ) -> WeightedDraws:
     """Return weighted draws (k, d), in rounds of as many as the `first` points (n, d).
 
-    They suffice for `draws`, or are all of `_MAX_ROUNDS`.
+    Rounds end as soon as all draws stand for `draws` (`is_enough`), or after `_MAX_ROUNDS`.
     """
     residuals = _residuals(density, first)
     level = float(_log_density(density, first, np.sum(residuals**2, axis=0)).max())

@@ -58,7 +58,10 @@ class ResponseSurface(NamedTuple):
 
 
 def residuals_of(surface: ResponseSurface, y: FloatArray) -> FloatArray:
-    """Return residuals (k, m) at curved coordinates and offset y (k, n + 1), the others there."""
+    """Return residuals (k, m) at curved coordinates and offset y (k, n + 1).
+
+    All other coordinates follow these.
+    """
     u = (y - surface.centre) / surface.size
     products = _products(u) @ surface.products.T
     return np.asarray(surface.constant + u @ surface.slopes.T + products)
@@ -111,7 +114,7 @@ def response_surface(
 
 
 class ParabolaSums(NamedTuple):
-    """Sums over points u (k, n) for parabolas of values (m,) of least squares."""
+    """Sums over points u (k, n) for least-squares parabolas of values (m,)."""
 
     gram: FloatArray  # (p, p) of constant, slopes and products
     image: FloatArray  # (p, m)

@@ -24,7 +24,7 @@ _TABLE = 1024  # frequencies of the numerical integral over the noise spectrum
 
 
 class RowFilter(NamedTuple):
-    """Low-pass, decimation and second difference in one: output k covers samples from k `every`."""
+    """Low-pass, decimation and second difference in one: output k begins at sample k `every`."""
 
     taps: FloatArray
     every: int

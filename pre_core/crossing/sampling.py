@@ -155,7 +155,7 @@ def _mismatch_draws(
 ) -> PosteriorDraws:
     """Return draws with mismatch: by the residuals where tyres are alike, else by their surface.
 
-    Residuals of alike tyres show a bridge so sharply that no surface follows them. Where weighted
+    With alike tyres the posterior is so narrow that no surface is exact enough. Where weighted
     draws do not suffice they are replaced by those of `compliances`, linear in c.
     """
     if has_alike_tyres(found.problem.mismatch):
@@ -172,9 +172,10 @@ def _mismatch_draws(
 def _alike_tyres_draws(
     found: Optimum, draws: int, seed: int, inflation: float, report: Report
 ) -> PosteriorDraws:
-    """Return draws weighted by the residuals, also where they have not converged.
+    """Return draws weighted by the residuals, even if these have not converged.
 
-    The others, linear in c, had errors of six standard deviations where those did not converge.
+    Draws linear in c, used only if few weighted ones are effective, had errors of six standard
+    deviations in such cases.
     """
     weighted, evaluations = drawn_by_residuals(found, draws, seed, inflation, report)
     if weighted.worth.ess < _LEAST_ESS:

@@ -97,7 +97,7 @@ def scan_offsets(
 
     The fit improves towards the right offset from afar, so that the scan ends beyond the best one.
     The axles of a tandem are too close together for that: other minima metres away fit well enough
-    to be accepted, with a wrong bridge, and the whole reach of the receiver is scanned.
+    to be accepted, with a wrong bridge, and all offsets that the receiver allows are scanned.
     """
     local_fit = _local_fit(problem, y, strategy)
     nothing = np.zeros(layout(problem).bridge.size)

@@ -39,7 +39,7 @@ def importance_draws(
     seed: int,
     report: Report,
 ) -> WeightedDraws:
-    """Return weighted draws in batches until they suffice, or all of `_MAX_BATCHES`.
+    """Return weighted draws in batches, until they suffice (`is_enough`) or `_MAX_BATCHES` exist.
 
     Each batch is of a surrogate, `now` at first, that is refined by the draws so far; its chains
     start about `start` (f,). All draws are weighted as of the mixture of the surrogates.

@@ -82,7 +82,7 @@ def sample_joint(
 ) -> FusedDraws:
     """Return draws of a bridge, `count` of each chain; they do not depend on `threads`.
 
-    `parts` are the crossings in `information`. On surfaces the bridge varies by the root mean
+    `parts` are the crossings in `information`. With surfaces the bridge varies by the root mean
     square of tau.
     """
     between = variability_posterior(information, priors)

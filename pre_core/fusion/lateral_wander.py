@@ -53,7 +53,7 @@ def align_runs_m(
 ) -> FloatArray:
     """Return the shift (k,) in m of each run's road along the chainage, relative to the others.
 
-    Without all road profiles the mismatches are compared instead.
+    Unless every run has a road profile, the mismatches are compared instead.
     """
     known = [road for road in roads if road is not None]
     if len(known) == len(roads):
@@ -197,7 +197,7 @@ def _claimed_power(mismatch: Mismatch) -> tuple[float, float]:
 def wander_posterior(mismatch: Mismatch, share: SharedFraction | None) -> WanderPosterior:
     """Return the posterior of the wander, given the runs' shared fraction of the short waves.
 
-    Without a share it is the prior's.
+    Without a shared fraction it is the prior.
     """
     weight = _seen(mismatch.shapes.cycles_per_m)
     whole = float(mismatch.level_m3 @ mismatch.shapes.density @ weight)

@@ -88,8 +88,9 @@ def likelihood(
 ) -> CrossingLikelihood:
     """Return the likelihood at an optimum.
 
-    Without `with_bends` it has no curvature terms, offset and response to short waves. The terms
-    are of a surface fitted at `points` (k, n + 1) as of `PosteriorDraws`, drawn if not given.
+    Without `with_bends` it has no curvature terms, no offset and no response to short waves. The
+    terms are those of a surface fitted at `points` (k, n + 1) as in `PosteriorDraws`; if none are
+    given, they are drawn.
     """
     problem, state = _in_fusion(found)
     where, mismatch = posterior.layout(problem), found.problem.mismatch

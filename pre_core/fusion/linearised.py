@@ -26,9 +26,10 @@ class Linearised(NamedTuple):
 
 
 def of_surface(surface: ResponseSurface, sigma: FloatArray) -> tuple[CurvatureTerms, Linearised]:
-    """Return the terms of a surface, and it with the offset and the terms after the waves.
+    """Return the curvature terms of a surface, and the surface in the form of `Linearised`.
 
-    `sigma` (elements,) are the spreads of ln EI, for c = exp(-sigma y).
+    Offset and terms come after the waves. `sigma` (elements,) are the spreads of ln EI, for c =
+    exp(-sigma y).
     """
     n = sigma.size
     weight, shapes = np.linalg.eigh(surface.products.T @ surface.products)

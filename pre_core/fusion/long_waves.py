@@ -1,6 +1,7 @@
-"""Long waves of a crossing's profile mismatch, as coefficients of cubic splines along the road.
+"""Profile mismatch of a crossing for fusion: its long waves, and its values off the bridge.
 
-And the mismatch off the bridge, at places that all crossings share.
+Long waves are coefficients of cubic splines along the road; the mismatch off the bridge is given at
+places that all crossings share.
 """
 
 from typing import NamedTuple
@@ -123,8 +124,8 @@ def add_adjacent_prior(
 ) -> None:
     """Add to a precision (n, n) the prior of coefficients next to the bridge given those on it.
 
-    In place; those at all knots `grid` (q,) begin at `first`. The prior of those on the bridge,
-    `inner` (k,), is added in fusion.
+    The precision is modified in place; its coefficients at all knots `grid` (q,) begin at `first`.
+    The prior of those on the bridge, `inner` (k,), is added in fusion.
     """
     of_all = covariance_of_all(mismatch, grid)
     places = first + np.arange(grid.size)

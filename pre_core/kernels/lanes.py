@@ -1,4 +1,4 @@
-"""Operations on four numbers at once: the vocabulary of the vector kernels.
+"""Operations on four numbers at once, of which the vector kernels are composed.
 
 A `Lanes` is a tuple of four floats, one for each of four parameter vectors (or modes). In this form
 numba's compiler keeps each tuple in one 256-bit register, which it does not achieve for short inner

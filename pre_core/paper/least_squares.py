@@ -37,7 +37,7 @@ class LeastSquaresProblem(NamedTuple):
 
 
 def transform(problem: LeastSquaresProblem, values: FloatArray) -> FloatArray:
-    """Return the search coordinates of free parameters (…, f) in physical units."""
+    """Return the search coordinates (…, f) of free parameters given in physical units."""
     y = np.log(values)
     at = np.flatnonzero(problem.free == D_1)
     d_1 = values[..., at]
@@ -46,7 +46,7 @@ def transform(problem: LeastSquaresProblem, values: FloatArray) -> FloatArray:
 
 
 def untransform(problem: LeastSquaresProblem, y: FloatArray) -> FloatArray:
-    """Return the free parameters in physical units of search coordinates (…, f)."""
+    """Return the free parameters (…, f), in physical units, for search coordinates (…, f)."""
     values = np.exp(y)
     at = np.flatnonzero(problem.free == D_1)
     values[..., at] = problem.window.wheelbase_m / (1.0 + np.exp(-y[..., at]))

@@ -24,9 +24,8 @@ from pre_core.physics.vehicle import HalfCar
 def from_models(car: HalfCar, beam: Beam) -> FloatArray:
     """Return the vector theta (p,) of a truck and a bridge of constant mass per length.
 
-    A half-car has no tandem: its share is zero.
-
-    Raise ValueError for a beam of varying mass per length: the parameter rhoA is one number.
+    A half-car has no tandem: its parameter `share` is zero. Raise ValueError for a beam of varying
+    mass per length: the parameter rhoA is one number.
     """
     if np.ptp(beam.mass_per_length_kg_per_m) > 0.0:
         raise ValueError("the unknown rhoA is one number: the beam must be of one mass per length")

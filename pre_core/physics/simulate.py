@@ -119,8 +119,8 @@ def simulate(
     """Drive the truck along `motion` and return accelerations, forces and deflections.
 
     The truck starts at rest in static equilibrium on a flat road at height zero, without spring
-    friction, and the bridge at rest, unloaded; `swing` is its initial vibration, in the modes of
-    this beam and number.
+    friction, and the bridge at rest, unloaded; `swing` is its initial vibration, given for as many
+    modes of this beam as `scheme` has.
 
     Integrating the accelerations by the same scheme from zero gives the displacements to rounding.
     """

@@ -20,7 +20,8 @@ moment,
 
 Friction f_i, which the law leaves out, then appears in the moment as o_2 f_2 + o_3 f_3, and remains
 as a force q on axle 2 and -q o_2/o_3 on axle 3, q = o_3 (o_3 f_2 - o_2 f_3)/(o_2² + o_3²). Friction
-of both axles that is independent and equally strong makes the two uncorrelated. (`Lead` selects.)
+of both axles that is independent and equally strong makes the two uncorrelated.
+(`Lead.is_equalised` selects.)
 """
 
 from typing import NamedTuple

@@ -11,7 +11,7 @@ from pre_core.arrays import FloatArray
 class LatentCoordinates(NamedTuple):
     """Normal coordinates v of values y, some of which must not be negative and may be zero.
 
-    Zero is any v below zero; a value that is never zero is that of v and -v.
+    A value that may be zero is zero for any v below zero; one that is never zero is |v|.
     """
 
     places: NDArray[np.int64]
