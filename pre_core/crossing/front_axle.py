@@ -40,7 +40,7 @@ RUNS: Final = 12.0
 """Number of runs over one profile for which fusion is exact; it is conservative with fewer."""
 _HIGHEST_HZ = 15.0
 _LONGEST_KNOTS = 160
-"""Largest number of values of a force; a slower truck's counts up to a lower frequency."""
+"""Largest number of values of a force; it lowers the highest frequency of a slower truck's."""
 _OVERSAMPLED = 16
 """Frequencies for each value in the integral of the covariance."""
 _SMALLEST = 0.05
@@ -57,7 +57,7 @@ class FrontAxleResponse(NamedTuple):
     """Covariance (K, K) in m²/s^4 of the acceleration's error at the knots, where the surface under
     the axle is as rough as off the bridge."""
     of_values: FloatArray
-    """The same (K, K) by the displaced values of the axle, for its nominal mass."""
+    """The same (K, K), caused by the displaced values of the axle, for its nominal mass."""
 
 
 def front_axle_response(problem: PosteriorProblem, y: FloatArray) -> FrontAxleResponse | None:
@@ -155,7 +155,7 @@ def _unit_motions(problem: PosteriorProblem, y: FloatArray) -> tuple[FloatArray,
 def _of_displaced_values(
     problem: PosteriorProblem, y: FloatArray, apart_s: float, count: int
 ) -> FloatArray:
-    """Return the covariance (K, K) in m²/s^4 at `count` knots by the displaced values.
+    """Return the covariance (K, K) in m²/s^4 at `count` knots that displaced values cause.
 
     The error of the inertia force that each causes is known but for its factor. It is treated as
     random with the spectrum that it has in the record: it contains the sensors' noise, which is in

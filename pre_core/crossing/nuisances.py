@@ -33,8 +33,8 @@ _LEAST_WAVE = 0.03
 """Smallest wave that is kept, in standard deviations of a residual."""
 _LEVEL = 10.0
 """Residual of the expected squares at the optimum: half its square bounds how far they may be above
-their tangent. Far smaller, it would bend where they are below; far larger, curvature of less than
-the smallest that fusion keeps would count."""
+their tangent. A far smaller one would be nonlinear where they are below; with a far larger one,
+curvature that matters would be less than the smallest that fusion keeps."""
 
 
 class ResidualParts(NamedTuple):

@@ -65,7 +65,7 @@ _COARSE_WITH_MISMATCH = (*_COARSE, (10.0, 4))
 with sensor noise alone the search would fail."""
 NOISY, HOPELESS_NOISE = 2.0, 25.0
 """Noise power ratio, the same in all body equations, above which the fit inflates the noise; above
-the second the sensor is another one, or broken."""
+the second the sensor is not the declared one, or broken."""
 _CLEAR_MISMATCH = 200.0
 """Mean square of whitened residuals off the bridge after the first stage: of 100 drawn crossings of
 one profile 130 at most and mostly below 25, with twin tyres on the best class of road 200,000."""

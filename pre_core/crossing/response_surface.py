@@ -22,9 +22,9 @@ from pre_core.crossing.nuisances import (
 )
 
 POINTS, POINTS_OF_DRAWS = 1920, 960
-"""Numbers of points to which a surface is fitted: one that is fused, fourteen for each of its
-coefficients, and one of a single crossing. Fewer, or repeated ones, have slopes with so much of the
-remainder of third order that other points move fused elements by twice their width.
+"""Numbers of points to which a surface is fitted: for fusion (fourteen for each of its
+coefficients), and for a single crossing. Fewer or repeated points leave so much of the third-order
+remainder in the slopes that other points move fused elements by twice their width.
 """
 _TOGETHER = 160
 """Number of points evaluated together: their residuals take some ten megabytes."""

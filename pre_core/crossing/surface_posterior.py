@@ -52,7 +52,7 @@ seldom outside, and is where many crossings are linearised in fusion."""
 _WIDER = 1.2
 """The same for the first points of draws by the residuals."""
 _FIRST_POINTS = 320
-"""Number of points of the first surface, which only says where the second is wanted."""
+"""Number of points of the first surface, which only locates the points of the second."""
 
 
 class SurfacePosterior(NamedTuple):

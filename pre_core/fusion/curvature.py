@@ -19,8 +19,8 @@ _FARTHEST = 2.0
 to which the surface was fitted."""
 _FARTHEST_OF_DIFFERENCES = 0.7
 """The same for terms in compliances: differences with that step, from the optimum of the crossing.
-Extrapolated to three sizes they made a bridge with a restrained end e times likelier, for each of
-twelve runs of an independent simulator, than the best fit of the run to that bridge."""
+Extrapolated to three sizes they overestimated the likelihood of a bridge with a restrained end by
+a factor of e, in each of twelve runs of an independent simulator."""
 _PLACE_STEPS = 4
 
 

@@ -89,8 +89,7 @@ def likelihood(
     """Return the likelihood at an optimum.
 
     Without `with_bends` it has no curvature terms, no offset and no response to short waves. The
-    terms are those of a surface fitted at `points` (k, n + 1) as in `PosteriorDraws`; if none are
-    given, they are drawn.
+    terms are of a surface fitted at `points` (k, n + 1) as of `PosteriorDraws`; None: drawn ones.
     """
     problem, state = _in_fusion(found)
     where, mismatch = posterior.layout(problem), found.problem.mismatch
