@@ -53,8 +53,9 @@ from pre_core.crossing.preparation import (
     update_noise,
     with_line,
 )
+from pre_core.crossing.refinement import refined, with_free_ends
 from pre_core.crossing.rows import RESIDUALS
-from pre_core.crossing.walk import Placement, better_neighbour, scan_offsets, shifted_to
+from pre_core.crossing.walk import Placement, scan_offsets, shifted_to
 from pre_core.search import levenberg_marquardt
 from pre_core.search.loop import Report, Termination
 
@@ -69,11 +70,6 @@ the second the sensor is not the declared one, or broken."""
 _CLEAR_MISMATCH = 200.0
 """Mean square of whitened residuals off the bridge after the first stage: of 100 drawn crossings of
 one profile 130 at most and mostly below 25, with twin tyres on the best class of road 200,000."""
-_CLEAR_RESTRAINT = 0.5
-"""Size of restraints, bearing compliance or torsion, in scales of their priors, above which the
-search is repeated without them."""
-_MAX_MOVES = 4
-"""Limit of moves from an optimum to a neighbouring one."""
 _SAME_MINIMUM_M = 0.2
 """Distance within which offsets lead to one minimum."""
 _HOPELESS_CHI2 = (FAR_OFF_CHI2, HOPELESS_CHI2)
@@ -277,9 +273,9 @@ def _refine_likeliest(
     if best.unfinished is not None and best.chi2_per_dof <= budget.chi2:
         completed = complete_fit(best)
         evaluations += completed.evaluations - best.evaluations
-        best, used = _refine_offset(completed, strategy, budget.evaluations - used)
+        best, used = refined(completed, strategy, budget.evaluations - used)
         evaluations += used
-    best, used = _with_free_ends(best, strategy)
+    best, used = with_free_ends(best, strategy)
     return best._replace(
         evaluations=evaluations + used,
         starts=tried,
@@ -320,7 +316,7 @@ def _fit_candidates(
             has_friction = True
             break
         if found.unfinished is None:
-            found, used = _refine_offset(found, strategy, budget.evaluations - evaluations)
+            found, used = refined(found, strategy, budget.evaluations - evaluations)
             evaluations += used
         last_chi2 = np.inf if best is None else best.chi2_per_dof
         if best is None or is_better(found, best):
@@ -377,49 +373,6 @@ def _find_truck(
     if strategy.models_mismatch and is_alike:
         problem = update_noise(problem, y, force, mismatch=levels_at(problem, y))
     return problem, y, evaluations
-
-
-def _with_free_ends(found: Optimum, strategy: SearchStrategy) -> tuple[Optimum, int]:
-    """Return the better optimum, with rotational restraints or without, and the evaluations.
-
-    A bridge restrained at both ends with less than half its stiffness deflects nearly as one on
-    free bearings, with a truck that is wrong by a third of its prior: a search that gets there
-    stays there.
-    """
-    where, y = layout(found.problem), found.state.y
-    ends = np.intersect1d(where.half_normal, where.bridge)
-    is_restrained = found.unfinished is None and np.any(y[ends] > _CLEAR_RESTRAINT)
-    if not is_restrained or found.chi2_per_dof > HOPELESS_CHI2:
-        return found, 0
-    start = y.copy()
-    start[where.bridge] = 0.0
-    other, used = fit_all(found.problem, start, strategy)
-    if other is None:
-        return found, used
-    other = complete_fit(other)
-    return (other if is_better(other, found) else found), other.evaluations
-
-
-def _refine_offset(
-    found: Optimum, strategy: SearchStrategy, max_evaluations: int
-) -> tuple[Optimum, int]:
-    """Return the best of an optimum and, with mismatch, its neighbours; and the evaluations."""
-    evaluations = 0
-    for _ in range(_MAX_MOVES):
-        if evaluations > max_evaluations or not found.problem.mismatch.level_m3.any():
-            break
-        place, used = better_neighbour(found, strategy)
-        evaluations += used
-        if place is None:
-            break
-        other, used = fit_all(
-            found.problem, shifted_to(found.problem, found.state.y, place), strategy
-        )
-        evaluations += used
-        if other is None or not is_better(other, found):
-            break
-        found = other
-    return found, evaluations
 
 
 def _excess_noise_power(found: Optimum) -> float:

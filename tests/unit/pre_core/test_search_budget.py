@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pre_core.crossing import fit, misfit, optimum, walk
+from pre_core.crossing import fit, misfit, optimum, refinement, walk
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.misfit import OffBridgeFit
 from pre_core.physics.tandem import NO_LEAD
@@ -21,9 +21,10 @@ STRATEGY = fit.SearchStrategy(0, False, 4, False)
 @pytest.fixture(autouse=True)
 def compared_by_chi2(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stand-ins have no posterior density."""
-    monkeypatch.setattr(
-        optimum, "is_better", lambda one, other: one.chi2_per_dof < other.chi2_per_dof
-    )
+    for module in (optimum, refinement):
+        monkeypatch.setattr(
+            module, "is_better", lambda one, other: one.chi2_per_dof < other.chi2_per_dof
+        )
 
 
 def found(chi2: float, evaluations: int, ending: Termination = Termination.CONVERGED) -> Any:
@@ -147,12 +148,34 @@ def test_noise_rounds_end_at_a_misfit_that_stays(
 
 def test_a_hopeless_fit_is_not_repeated_with_free_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     where = SimpleNamespace(half_normal=np.arange(2), bridge=np.arange(2))
-    monkeypatch.setattr(optimum, "layout", lambda _: where)
-    monkeypatch.setattr(optimum, "fit_all", lambda *_: (found(1.0, 7), 7))
+    monkeypatch.setattr(refinement, "layout", lambda _: where)
+    monkeypatch.setattr(refinement, "_is_sharp", lambda _: False)
+    monkeypatch.setattr(refinement, "fit_all", lambda *_: (found(1.0, 7), 7))
     for chi2, used in ((24.0, 7), (26.0, 0)):
         restrained = found(chi2, 1)._replace(state=SimpleNamespace(y=np.ones(2)))
-        better, evaluations = optimum._with_free_ends(restrained, STRATEGY)
+        better, evaluations = refinement.with_free_ends(restrained, STRATEGY)
         assert (better.chi2_per_dof, evaluations) == (1.0 if used else chi2, used)
+
+
+def test_other_bridges_are_tried_until_two_sets_of_starts_fail(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sets: list[bool] = []
+    chi2 = iter((4.0, 3.0, 3.5, 3.6, 3.7, 3.8))
+
+    def others(_: Any, __: Any, *, is_even: bool) -> tuple[list[Any], int]:
+        sets.append(is_even)
+        return [SimpleNamespace(y=np.zeros(1)) for _ in range(3)], 10
+
+    monkeypatch.setattr(refinement, "other_bridges", others)
+    monkeypatch.setattr(refinement, "_is_sharp", lambda _: True)
+    monkeypatch.setattr(refinement, "complete_fit", lambda one: one)
+    monkeypatch.setattr(refinement, "fit_all", lambda *_: (found(next(chi2), 1), 1))
+    best, evaluations = refinement.refined(found(3.9, 1), STRATEGY, 1000)
+    # The second bridge of the first set is better; then two of each of the two sets are not.
+    assert best.chi2_per_dof == 3.0
+    assert sets == [True, False, True]
+    assert evaluations == 3 * 10 + 6
 
 
 @pytest.mark.parametrize(
@@ -279,7 +302,7 @@ def refined(
     monkeypatch.setattr(optimum, "scan_offsets", lambda *_: (places, 0))
     monkeypatch.setattr(optimum, "shifted_to", lambda _, y, place: y)
     monkeypatch.setattr(optimum, "is_accepted", lambda _, value: value < 1.5)
-    monkeypatch.setattr(optimum, "_with_free_ends", lambda best, _: (best, 0))
+    monkeypatch.setattr(optimum, "with_free_ends", lambda best, _: (best, 0))
     monkeypatch.setattr(
         optimum, "fit_all", lambda *_: (next(candidates)._replace(problem=problem), 1)
     )

@@ -1,0 +1,216 @@
+"""Search for other bridges by low frequencies first.
+
+A bridge that vibrates at a wrong frequency is a local minimum: its oscillation slips by a period
+against the measured one, and each small change fits worse. Similar profiles of both axles (equal
+tyres, tandems) leave so little noise that a quarter of the searches ended there, up to 300 in the
+log posterior below the true bridge, and fitted. Below the first frequency the deflection is nearly
+static: linear in the compliances of elements and bearings. So bridges are fitted to the residuals
+below a frequency that is doubled stage by stage, each of which brings the next oscillation within
+half a period (frequency continuation, as in seismic inversion: Bunks, Saleck, Zaleski and Chavent
+1995). Truck and trajectory follow to first order, but for the offset.
+"""
+
+from collections.abc import Iterator
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dct
+
+from pre_core.arrays import FloatArray
+from pre_core.crossing.fit import (
+    Optimum,
+    SearchStrategy,
+    evaluations_of,
+    resting_mode_indices,
+    tempered_residuals,
+)
+from pre_core.crossing.pavement import known_pavement
+from pre_core.crossing.posterior import PosteriorProblem, layout
+from pre_core.crossing.preparation import update_noise
+from pre_core.crossing.rows import RESIDUALS
+from pre_core.parameters import K_ROT, F
+from pre_core.search import levenberg_marquardt
+from pre_core.search.levenberg_marquardt import minimise
+
+_STAGES_HZ = (1.5, 3.0, 6.0, 12.0, 24.0)
+_STEPS, _LAST_STEPS = 10, 20
+"""Limits of the steps of a stage, and of the fit to all frequencies after them."""
+_ENOUGH = 0.5
+"""Improvement of the sum of squares that ends a stage."""
+_FEWEST_WAVES = 8
+_SMALLEST_COMPLIANCE = 0.1
+"""Smallest compliance of an element in a fit, relative to the nominal one."""
+_LARGEST_SHARE = 0.99
+_SAME_BRIDGE = 0.3
+"""Distance of two bridges, in spreads of their priors and metres, that are one."""
+
+
+class OtherBridge(NamedTuple):
+    """A bridge fitted from another start, and the sum of squares there."""
+
+    objective: float
+    y: FloatArray
+    """The point (f,) with this bridge and its offset, everything else as it was."""
+
+
+class _Coordinates(NamedTuple):
+    """Coordinates u (…, n + 1) of bridge and offset in which a static deflection is nearly linear.
+
+    Elements are compliances relative to the nominal ones, rotational restraints y are y/(1 + y).
+    """
+
+    places: NDArray[np.int64]  # (n,) indices in y
+    elements: NDArray[np.int64]  # indices in u, as the next
+    restraints: NDArray[np.int64]
+    compliant: NDArray[np.int64]
+    lower: FloatArray  # (n + 1,)
+    spread: FloatArray  # of the elements
+
+    def to_y(self, u: FloatArray) -> FloatArray:
+        """Return the coordinates (…, n + 1) in y of u (…, n + 1), with the offset in m."""
+        y = u.copy()
+        c = np.maximum(u[..., self.elements], 0.5 * _SMALLEST_COMPLIANCE)
+        y[..., self.elements] = -np.log(c) / self.spread
+        share = np.minimum(u[..., self.restraints], _LARGEST_SHARE)
+        y[..., self.restraints] = share / (1.0 - share)
+        return y
+
+    def from_y(self, y: FloatArray) -> FloatArray:
+        """Return u (n + 1,) of the coordinates (n + 1,) in y."""
+        u = y.copy()
+        u[self.elements] = np.exp(-y[self.elements] * self.spread)
+        u[self.restraints] = y[self.restraints] / (1.0 + y[self.restraints])
+        return np.maximum(u, self.lower)
+
+
+def other_bridges(
+    found: Optimum, strategy: SearchStrategy, *, is_even: bool
+) -> tuple[list[OtherBridge], int]:
+    """Return bridges that fit better than an optimum with mismatch, best first; and evaluations.
+
+    They are fitted from elements of nominal rigidity on bearings that are free or restrained, rigid
+    or compliant: both ends alike if `is_even`, else each at one end. The noise is that of a deck as
+    rough as the road: a wrong bridge passes for a rough deck, whose noise would hide a better one.
+    """
+    y = found.state.y
+    problem = update_noise(
+        found.problem, y, found.problem.force, mismatch=found.problem.mismatch.level_m3,
+        pavement=known_pavement(found.problem, y, 1.0),
+    )  # fmt: skip
+    at = _coordinates(problem)
+    fit = _ContinuedFit(problem, y, strategy, at)
+    here = OtherBridge(fit.objective(np.append(y[at.places], 0.0)), y)
+    # With this noise the optimum's own bridge may lead to a better one, too.
+    starts = [
+        (np.append(y[at.places], 0.0), ()),
+        *((one, _STAGES_HZ) for one in _starts(at, is_even=is_even)),
+    ]
+    tried = sorted((fit.run(start, stages) for start, stages in starts), key=_objective)
+    distinct = [here]
+    for one in sorted(tried, key=_objective):
+        moves = [np.abs(one.y - other.y)[[*at.places, -1]].max() for other in distinct]
+        if one.objective < here.objective - _ENOUGH and min(moves) > _SAME_BRIDGE:
+            distinct.append(one)
+    return distinct[1:], fit.evaluations
+
+
+def _objective(one: OtherBridge) -> float:
+    return one.objective
+
+
+def _coordinates(problem: PosteriorProblem) -> _Coordinates:
+    where = layout(problem)
+    kept = np.flatnonzero(problem.priors.estimated)
+    places = where.bridge
+    names = kept[places]
+    lower = np.full(places.size + 1, -np.inf)
+    lower[np.flatnonzero(np.isin(places, where.half_normal))] = 0.0
+    elements = np.flatnonzero(np.isin(places, where.elements))
+    lower[elements] = _SMALLEST_COMPLIANCE
+    return _Coordinates(
+        places,
+        elements,
+        np.flatnonzero(np.isin(names, (K_ROT, K_ROT + 1))),
+        np.flatnonzero(np.isin(names, (F, F + 1))),
+        lower,
+        problem.priors.spread[names[elements]],
+    )
+
+
+def _starts(at: _Coordinates, *, is_even: bool) -> Iterator[FloatArray]:
+    """Yield coordinates (n + 1,) in y to start from."""
+    ends = ((0.0, 0.0), (1.0, 1.0)) if is_even else ((1.0, 0.0), (0.0, 1.0))
+    given = set()
+    for restraints, compliances in product(ends, ends):
+        start = np.zeros(at.places.size + 1)
+        start[at.restraints] = restraints[: at.restraints.size]
+        start[at.compliant] = compliances[: at.compliant.size]
+        if start.tobytes() not in given:
+            given.add(start.tobytes())
+            yield start
+
+
+class _ContinuedFit:
+    """Fits of bridge and offset about a point y (f,), everything else to first order."""
+
+    def __init__(
+        self,
+        problem: PosteriorProblem,
+        y: FloatArray,
+        strategy: SearchStrategy,
+        at: _Coordinates,
+    ) -> None:
+        where = layout(problem)
+        self.evaluations = y.size + 1
+        self._at, self._y, self._where = at, y, where
+        jacobian = levenberg_marquardt.initial_state(
+            tempered_residuals(problem, y, np.eye(y.size), 1.0), np.zeros(y.size)
+        ).jacobian
+        # The offset moves the whole trajectory, whose other coordinates are relative to one.
+        middle = (where.trajectory.start + where.trajectory.stop) // 2
+        held = np.concatenate([at.places, resting_mode_indices(problem, strategy), [middle]])
+        self._others, _ = np.linalg.qr(np.delete(jacobian, held, axis=1))
+        directions = np.zeros((y.size, at.places.size + 1))
+        directions[at.places, np.arange(at.places.size)] = 1.0
+        directions[where.trajectory, -1] = 1.0
+        without_bridge = y.copy()
+        without_bridge[at.places] = 0.0
+        self._rows = tempered_residuals(problem, without_bridge, directions, 1.0)
+        self._data = problem.noise.reciprocal.size
+        duration_s = self._data // RESIDUALS * problem.rows.every * problem.rows.step_s
+        self._waves_per_hz = 2.0 * duration_s
+
+    def objective(self, start: FloatArray) -> float:
+        """Return the sum of squares at coordinates (n + 1,) in y."""
+        rows = self._rows(start[None, :])
+        self.evaluations += 1
+        return float(np.sum((rows - (rows @ self._others) @ self._others.T) ** 2))
+
+    def run(self, start: FloatArray, stages_hz: tuple[float, ...]) -> OtherBridge:
+        """Return the bridge fitted below each of the frequencies, and at last to all."""
+        u = self._at.from_y(start)
+        for up_to_hz in stages_hz:
+            u, _ = self._stage(u, up_to_hz, _STEPS)
+        u, objective = self._stage(u, np.inf, _LAST_STEPS)
+        y, moved = self._y.copy(), self._at.to_y(u)
+        y[self._at.places] = moved[:-1]
+        y[self._where.trajectory] += moved[-1]
+        return OtherBridge(objective, y)
+
+    def _stage(self, u: FloatArray, up_to_hz: float, steps: int) -> tuple[FloatArray, float]:
+        """Return the coordinates fitted to mismatch residuals below a frequency, and squares."""
+
+        def residuals(points: FloatArray) -> FloatArray:
+            rows = self._rows(self._at.to_y(points))
+            rows = rows - (rows @ self._others) @ self._others.T
+            if np.isinf(up_to_hz):
+                return np.asarray(rows)
+            waves = max(_FEWEST_WAVES, int(self._waves_per_hz * up_to_hz))
+            low = dct(rows[:, : self._data : RESIDUALS], axis=1, norm="ortho")[:, :waves]
+            return np.hstack([low, rows[:, self._data :]])
+
+        found = minimise(residuals, u, steps, _ENOUGH, self._at.lower, is_followed=True)
+        self.evaluations += evaluations_of(found)
+        return found.state.y, found.state.objective

@@ -1,0 +1,106 @@
+"""Refinement of an optimum: starts from other offsets, bearings and bridges."""
+
+import numpy as np
+
+from pre_core.crossing.comparison import is_better
+from pre_core.crossing.fit import (
+    HOPELESS_CHI2,
+    Optimum,
+    SearchStrategy,
+    complete_fit,
+    fit_all,
+)
+from pre_core.crossing.frequency_continuation import other_bridges
+from pre_core.crossing.mismatch import has_alike_tyres
+from pre_core.crossing.posterior import layout
+from pre_core.crossing.walk import better_neighbour, shifted_to
+
+_CLEAR_RESTRAINT = 0.5
+"""Size of restraints, bearing compliance or torsion, in scales of their priors, above which the
+search is repeated without them."""
+_MAX_MOVES = 4
+"""Limit of moves from an optimum to a neighbouring one."""
+_TRIED_BRIDGES = 2
+"""Limit of other bridges from which all parameters are fitted, after each optimum."""
+
+
+def refined(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> tuple[Optimum, int]:
+    """Return the best of an optimum and those that follow from it, and the evaluations."""
+    if _is_sharp(found):
+        return _with_other_bridge(found, strategy, max_evaluations)
+    return _refine_offset(found, strategy, max_evaluations)
+
+
+def _is_sharp(found: Optimum) -> bool:
+    """Return whether bridges of other frequencies are tried: similar profiles, and nearly a fit."""
+    mismatch = found.problem.mismatch
+    is_sharp = mismatch.level_m3.any() and has_alike_tyres(mismatch)
+    return bool(is_sharp and found.unfinished is None and found.chi2_per_dof <= HOPELESS_CHI2)
+
+
+def _with_other_bridge(
+    found: Optimum, strategy: SearchStrategy, max_evaluations: int
+) -> tuple[Optimum, int]:
+    """Return the best of an optimum and those of other bridges, and the evaluations."""
+    evaluations, failed = 0, 0
+    is_even = True
+    while failed < 2 and evaluations <= max_evaluations and _is_sharp(found):
+        others, used = other_bridges(found, strategy, is_even=is_even)
+        evaluations += used
+        before = found
+        for other in others[:_TRIED_BRIDGES]:
+            fitted, used = fit_all(found.problem, other.y, strategy)
+            evaluations += used
+            if fitted is None:
+                continue
+            completed = complete_fit(fitted)
+            evaluations += completed.evaluations - fitted.evaluations
+            if is_better(completed, found):
+                found = completed
+                break
+        failed = failed + 1 if found is before else 0
+        is_even = not is_even
+    return found, evaluations
+
+
+def _refine_offset(
+    found: Optimum, strategy: SearchStrategy, max_evaluations: int
+) -> tuple[Optimum, int]:
+    """Return the best of an optimum and, with mismatch, its neighbours; and the evaluations."""
+    evaluations = 0
+    for _ in range(_MAX_MOVES):
+        if evaluations > max_evaluations or not found.problem.mismatch.level_m3.any():
+            break
+        place, used = better_neighbour(found, strategy)
+        evaluations += used
+        if place is None:
+            break
+        other, used = fit_all(
+            found.problem, shifted_to(found.problem, found.state.y, place), strategy
+        )
+        evaluations += used
+        if other is None or not is_better(other, found):
+            break
+        found = other
+    return found, evaluations
+
+
+def with_free_ends(found: Optimum, strategy: SearchStrategy) -> tuple[Optimum, int]:
+    """Return the better optimum, with rotational restraints or without, and the evaluations.
+
+    A bridge restrained at both ends with less than half its stiffness deflects nearly as one on
+    free bearings, with a truck that is wrong by a third of its prior: a search that gets there
+    stays there. Fits of `other_bridges` have such starts already.
+    """
+    where, y = layout(found.problem), found.state.y
+    ends = np.intersect1d(where.half_normal, where.bridge)
+    is_restrained = found.unfinished is None and np.any(y[ends] > _CLEAR_RESTRAINT)
+    if not is_restrained or _is_sharp(found) or found.chi2_per_dof > HOPELESS_CHI2:
+        return found, 0
+    start = y.copy()
+    start[where.bridge] = 0.0
+    other, used = fit_all(found.problem, start, strategy)
+    if other is None:
+        return found, used
+    other = complete_fit(other)
+    return (other if is_better(other, found) else found), other.evaluations
