@@ -280,10 +280,12 @@ def _print(console: "Console", found: Results, site: Site) -> None:
 
 def print_validation(console: "Console", found: Results, site: Site, folder: Path) -> None:
     """Print which site validations cover the intervals, and which are missing, by bridge."""
+    from rich.markup import escape
+
     pairs = ValidatedPairs(found.crossings)
     for bridge in dict.fromkeys(crossing.bridge for crossing in found.crossings):
         for note in pairs.notes(folder, site, bridge):
-            console.print(f"[bold]{bridge}:[/] {note}", highlight=False, soft_wrap=True)
+            console.print(f"[bold]{bridge}:[/] {escape(note)}", highlight=False, soft_wrap=True)
 
 
 def _as_state(bridge: Bridge, state: BridgeResult) -> str:

@@ -100,7 +100,8 @@ def validation_notes(
                 remedy=language.text(f"caution.try.{truck_to_try(site.vehicle(pair.vehicle))}"),
             )
     if untried:
-        yield language.text("caution.unvalidated", trucks=language.listed(untried))
+        trucks = language.listed(untried)
+        yield language.text("caution.unvalidated", trucks=trucks, folder=folder.absolute())
 
 
 def validations_passed(

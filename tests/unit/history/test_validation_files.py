@@ -17,10 +17,14 @@ from tests.builders.certificates import certificate
 from tests.unit.viewer.found import results_of, some_crossing
 
 PAIR = VehicleBridgePair("truck-1", "bridge-1")
-UNTRIED = (
-    "No site validation of truck-1 on this bridge: whether the intervals contain the truth has not "
-    "been tested. Run driveby validate --site site.toml."
-)
+
+
+def untried(folder: Path) -> str:
+    return (
+        f"No site validation of truck-1 on this bridge in {folder}: whether the intervals contain "
+        "the truth has not been tested. Run driveby validate --site site.toml, or name its folder "
+        "(--validations)."
+    )
 
 
 def test_pairs_are_those_of_intervals_without_a_record(site: Site) -> None:
@@ -33,11 +37,21 @@ def test_pairs_are_those_of_intervals_without_a_record(site: Site) -> None:
 
 
 def test_untried_pairs_share_a_sentence(site: Site, tmp_path: Path) -> None:
-    assert list(validation_notes(tmp_path / "none", site, [PAIR])) == [UNTRIED]
+    none = tmp_path / "none"
+    assert list(validation_notes(none, site, [PAIR])) == [untried(none)]
     assert list(validation_notes(tmp_path, site, [])) == []
     both = [PAIR, VehicleBridgePair("truck-2", "bridge-1")]  # the second is not of the site
     (line,) = validation_notes(tmp_path, site, both)
     assert "of truck-1 and truck-2 on this bridge" in line
+
+
+def test_relative_folder_is_named_as_a_whole(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It depends on the working folder, where a report may be made elsewhere than the record."""
+    monkeypatch.chdir(tmp_path)
+    folder = Path("recordings/certificates")
+    assert list(validation_notes(folder, site, [PAIR])) == [untried(tmp_path / folder)]
 
 
 def test_record_of_the_pair_decides(site: Site, tmp_path: Path) -> None:
@@ -78,12 +92,12 @@ def test_record_of_another_truck_counts_for_nothing(site: Site, tmp_path: Path) 
     save(tmp_path, certificate(site))
     heavier = site.vehicles[0].model_copy(update={"total_mass_kg": 9999.0})
     changed = site.model_copy(update={"vehicles": (heavier,)})
-    assert list(validation_notes(tmp_path, changed, [PAIR])) == [UNTRIED]
+    assert list(validation_notes(tmp_path, changed, [PAIR])) == [untried(tmp_path)]
 
 
 def test_unreadable_record_is_a_warning(
     site: Site, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     save(tmp_path, certificate(site)).write_text("{")
-    assert list(validation_notes(tmp_path, site, [PAIR])) == [UNTRIED]
+    assert list(validation_notes(tmp_path, site, [PAIR])) == [untried(tmp_path)]
     assert len(caplog.records) == 1
