@@ -30,7 +30,7 @@ studies/site-validation.md."""
 _NOT_OF_A_CERTIFICATE: Final = NOT_OF_THE_RESULT | {"seed"}
 """Settings that do not change the method. The seed is chance, which the validation itself varies.
 """
-_NOT_OF_A_BRIDGE: Final = frozenset({"owner_id", "baseline"})
+NOT_OF_A_BRIDGE: Final = frozenset({"owner_id", "baseline"})
 """Keys that describe a bridge but not its motion."""
 
 
@@ -163,7 +163,7 @@ def pair_hash(site: Site, pair: VehicleBridgePair, settings: IdentificationSetti
         "method_edition": METHOD_EDITION,
         "settings": settings.model_dump(mode="json", exclude=set(_NOT_OF_A_CERTIFICATE)),
         "vehicle": site.vehicle(pair.vehicle).shortest(),
-        "bridge": site.bridge(pair.bridge).model_dump(mode="json", exclude=set(_NOT_OF_A_BRIDGE)),
+        "bridge": site.bridge(pair.bridge).model_dump(mode="json", exclude=set(NOT_OF_A_BRIDGE)),
         "sensor": site.sensor.model_dump(mode="json"),
         "receiver": site.receiver.model_dump(mode="json"),
     }
