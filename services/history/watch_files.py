@@ -20,6 +20,8 @@ from services.history.history_store import HistoryRow
 from services.history.periods import Unit, begin_of
 
 _CHECKS: Final = "checks"
+_CLOCK_S: Final = 60.0
+"""Largest difference in s of two clocks that agree."""
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0)]
 
@@ -81,7 +83,7 @@ class MonitoringState(NamedTuple):
         if record is None:
             return language.text(f"watch.{'damaged' if self.is_damaged else 'never_checked'}")
         judged = "many" if record.judged != 1 else "one"
-        return language.text(
+        stated = language.text(
             f"watch.{self.state}" + (f".{judged}" if self.state == "watched" else ""),
             unit=language.text(record.period),
             units=language.text(f"{record.period}s"),
@@ -96,6 +98,9 @@ class MonitoringState(NamedTuple):
             last=day_of(record.judged_to),
             change=language.number(100.0 * record.at_least, "g"),
         )
+        if record.newest is None or record.newest <= record.checked + _CLOCK_S:
+            return stated
+        return f"{stated} {language.text('watch.future', newest=day_of(record.newest))}"
 
     @property
     def found_nothing(self) -> bool:

@@ -144,6 +144,20 @@ def test_crossings_that_came_after_the_check_are_not_vouched_for(tmp_path: Path)
     assert watch_now(tmp_path).found_nothing
 
 
+def test_crossings_dated_in_the_future_are_named(history: Path) -> None:
+    """A rehearsal dates its second survey a year ahead."""
+    now_s = BEGIN_S + 3.0 * WEEK_S
+    check(history, AlarmSettings(), now_s)
+    found = watch_now(history, now_s=now_s)
+    assert found.sentence == (
+        "Not monitored yet: 3 of 8 training weeks, up to 2025-01-27. Crossings dated after the "
+        f"check, up to {newest_day(history)}, do not count yet."
+    )
+    assert "nach der Prüfung" in found.words(language_of("de"))
+    check(history, AlarmSettings(), AFTER_S)
+    assert "dated after" not in watch_now(history).sentence
+
+
 def test_an_unchanged_bridge_is_not_read_to_say_that_it_is_watched(
     history: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -163,6 +177,11 @@ def test_an_unchanged_bridge_is_not_read_to_say_that_it_is_watched(
     os.utime(record, (added_s + 120.0, added_s + 120.0))
     assert watch_now(history).found_nothing
     assert watch_now(history, now_s=AFTER_S + WEEK_S).state == "out_of_date"
+
+
+def newest_day(history: Path) -> str:
+    newest_s = float(load_newest(record_path(history, "sim-fleet", "bridge-1")))
+    return f"{datetime.fromtimestamp(newest_s, UTC):%Y-%m-%d}"
 
 
 def load_newest(record: Path) -> float:
