@@ -291,6 +291,10 @@ def test_finding_names_the_change_over_time(site: Site, tmp_path: Path, code: st
     before = report_on(site, results_of(site, some_crossing("a"), used="a"), baseline=path)
     first, *_ = with_history(before, past, language).cautions
     assert first.startswith(language.text("caution.baseline", over_time=""))
+    assert {"en": "The change to state is the one above", "de": "Anzugeben ist die Änderung oben"}[
+        code
+    ] in first
+    assert "--baseline" not in first
 
 
 def test_active_alarm_takes_reassurance_from_a_report(site: Site, tmp_path: Path) -> None:
