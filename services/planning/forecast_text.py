@@ -88,7 +88,9 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     yield "±: standard deviation of EI; near 55 % the measurement adds nothing; seen:"
     yield "probability that the loss is detected against the nominal value; vs others:"
     wanted = percent(DETECTION_PROBABILITY)
-    yield f"against the others; smallest: loss that is detected with {wanted} probability"
+    yield "against the others; next to supports, whose springs are unknown, less is seen"
+    yield "against the nominal value than the same ± elsewhere suggests;"
+    yield f"smallest: loss that is detected with {wanted} probability"
     yield f"detected: by a one-sided test with {false} false alarms; a report calls an element"
     clear = percent(CLEAR_LOSS)
     yield f"clearly less stiff only if its whole 95 % interval is more than {clear} below"

@@ -116,3 +116,8 @@ def key(row: Row) -> tuple[float, float, float]:
 def test_table_names_the_rows_without_advice() -> None:
     text = " ".join(lines_of(forecast((9, 40, 0.2))))
     assert "the advice leaves out tandems, whose forecast is too optimistic, and fewer el" in text
+
+
+def test_legend_says_why_equal_deviations_are_seen_unequally() -> None:
+    text = " ".join(lines_of(forecast((9, 40, 0.2))))
+    assert "next to supports, whose springs are unknown, less is seen" in text
