@@ -140,8 +140,8 @@ def hosts_of(certificate: x509.Certificate) -> list[str]:
 def unlisted_hint(folder: Path) -> str:
     """Return why a router may send nothing to the holder of a folder's credentials."""
     return (
-        f"the router's list of participants lacks {check_credentials(folder)}, see "
-        "docs/security.md#changes"
+        f"the router's list of participants lacks {check_credentials(folder)}, which is new "
+        "or revoked, see docs/security.md#changes"
     )
 
 

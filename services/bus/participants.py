@@ -80,7 +80,7 @@ class SubscriberCheck:
         other = "" if is_logger else "no logger is connected to it, or "
         return (
             f"nothing at {router} subscribes to {who}: {other}its list of participants lacks this "
-            "certificate, see docs/security.md#changes"
+            "certificate, which is new or revoked, see docs/security.md#changes"
         )
 
     def close(self) -> None:

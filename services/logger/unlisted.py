@@ -40,8 +40,9 @@ class UnlistedLog:
                 self._logged_s.clear()
             self._logged_s[name] = now_s
             _log.warning(
-                "%s is connected and not listed in %s: dropping all of its messages; copy the "
-                "list of `driveby certs` there and restart (docs/security.md#changes)",
+                "%s is connected and not listed in %s: dropping all of its messages; unless "
+                "it is revoked, copy the list of `driveby certs` there and restart "
+                "(docs/security.md#changes)",
                 *(name, self._tls / CONFIGURATION),
             )
 

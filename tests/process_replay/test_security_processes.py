@@ -121,11 +121,13 @@ def test_unlisted_truck_fails_named_and_its_spool_keeps_everything(
     assert truck.returncode == 1
     assert log.splitlines()[-1] == (
         "driveby: none of 401 messages was received: nothing at logger/logger subscribes to "
-        "truck-1: its list of participants lacks this certificate, see docs/security.md#changes; "
-        "the spool keeps the messages"
+        "truck-1: its list of participants lacks this certificate, which is new or revoked, see "
+        "docs/security.md#changes; the spool keeps the messages"
     )
     where = lacking / "logger" / "zenoh.json5"
-    assert stop(first).count(f"truck/truck-1 is connected and not listed in {where}") == 1
+    log = stop(first)
+    assert log.count(f"truck/truck-1 is connected and not listed in {where}") == 1
+    assert "unless it is revoked, copy the list" in log
     assert not identities(tmp_path / "r")
     second = logger(credentials / "logger")
     with open_session(

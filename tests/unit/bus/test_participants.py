@@ -18,7 +18,10 @@ from tests.intruders import raw_session
 from tests.waiting import LONGEST_S, until
 
 TRUCK = Key("live", "vehicle", "truck-1", "accel")
-LACKS = "its list of participants lacks this certificate, see docs/security.md#changes"
+LACKS = (
+    "its list of participants lacks this certificate, which is new or revoked, see "
+    "docs/security.md#changes"
+)
 
 
 @pytest.fixture
