@@ -121,25 +121,30 @@ class Fusion(NamedTuple):
         return f"{name}: {number} {noun} fused, {state.verdict}; {state.finding or ''}".rstrip("; ")
 
 
+Source = Name | Identification | Fusion | Results
+
+
 @known_arguments()
 def fuse(
-    *sources: Name | Identification | Fusion | Results,
-    baseline: Name | Identification | Fusion | Results | None = None,
+    *sources: Source | Sequence[Source],
+    baseline: Source | None = None,
     fuse_suspect: bool = False,
     site: Name | Site | None = None,
 ) -> Fusion:
     """Fuse all crossings of results (files, or what `identify` returned), each once.
 
+    Several are several arguments, or lists of them.
     `baseline` is compared with. `site` is needed for a figure or report of files alone. BLAS is
     limited to one thread meanwhile. The same results give the same numbers as `driveby fuse`.
 
     Raise InputError, in one line, for unreadable results, several realms, crossings that differ and
     have one identifier, or nothing that can be fused.
     """
-    if not sources:
+    given = list(_each_of(sources))
+    if not given:
         raise InputError("no results given, results.json or the value of identify() expected")
-    name = next((str(one) for one in sources if isinstance(one, str | PathLike)), "fuse")
-    each = [_results("source", one) for one in sources]
+    name = next((str(one) for one in given if isinstance(one, str | PathLike)), "fuse")
+    each = [_results("source", one) for one in given]
     check_identifiers(each)
     found = crossings_to_fuse(name, each)
     stored = None if baseline is None else _results("baseline", baseline)
@@ -155,8 +160,17 @@ def fuse(
     if stored is not None:
         for line in baseline_cautions(fused.results.bridges, stored.bridges):
             warnings.warn(line, stacklevel=3)
-    known = _newest_site(sources) if site is None else given_site(site)
+    known = _newest_site(given) if site is None else given_site(site)
     return Fusion(fused.results, fused.bridges, known, stored)
+
+
+def _each_of(sources: Iterable[object]) -> Iterator[object]:
+    """Yield sources and those of lists; results are named tuples, and no lists of others."""
+    for one in sources:
+        if isinstance(one, list) or type(one) is tuple:
+            yield from one
+        else:
+            yield one
 
 
 def _results(name: str, source: object) -> Results:

@@ -651,7 +651,9 @@ ROAD = "it must be a class from A to E or a pair of arrays (x_m, height_m)"
         (lambda: driveby.survey(paper_site(), speed=[11, 9]), "speed is 9, it must be from 11"),
         (lambda: driveby.survey(paper_site(), noise="9"), 'noise is "9", it must be a number'),
         (lambda: driveby.fuse(3), "source is 3, it must be the name of a results file"),
-        (lambda: driveby.fuse(["a.json"]), "source is ['a.json'], it must be the name of a"),
+        (lambda: driveby.fuse([3]), "source is 3, it must be the name of a results file"),
+        (lambda: driveby.fuse([["a"]]), "source is ['a'], it must be the name of a"),
+        (lambda: driveby.fuse([]), "no results given, results.json or the value of identify() "),
         (lambda: driveby.report(["a.json"]), "source is ['a.json'], it must be the name of a"),
         (
             lambda: driveby.simulate(start="x"),
@@ -715,6 +717,8 @@ def test_fused_bridge_is_that_of_the_command_line(tmp_path: Path) -> None:
     other = write(tmp_path / "other.json", [crossing(n) for n in range(2, 5)])
     assert cli.main(["fuse", str(one), str(other), "--json", str(tmp_path / "a.json")]) == 0
     fused = driveby.fuse(one, str(other))
+    for given in ([one, str(other)], (one, str(other))):
+        assert driveby.fuse(given).results.bridges == fused.results.bridges
     fused.to_json(tmp_path / "b.json")
     mine, theirs = (json.loads((tmp_path / n).read_text()) for n in ("a.json", "b.json"))
     del mine["created"], theirs["created"]
