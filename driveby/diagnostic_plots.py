@@ -20,6 +20,8 @@ _COLUMNS: Final = 4
 _BINS: Final = 60
 _SHOWN: Final = 6.0
 """Posterior standard deviations on either side of the mean that are drawn."""
+_POSTERIOR_OPACITY: Final = 0.6
+"""Opacity through which the prior behind the posterior shows."""
 _CUT: Final = (0.5, 99.5)
 """Percentiles of the prior draws that are drawn."""
 
@@ -91,7 +93,7 @@ def plot_posterior(
                     color="0.8",
                     label="prior",
                 )
-            axes.hist(draws, bins=_BINS, density=True, label="posterior")
+            axes.hist(draws, bins=_BINS, density=True, alpha=_POSTERIOR_OPACITY, label="posterior")
             for limit in (found.q025, found.q975):
                 axes.axvline(limit / divisor, color="0.3", lw=0.8, ls="--")
             reach = np.array([-_SHOWN, _SHOWN]) * found.std

@@ -952,6 +952,9 @@ def test_diagnostic_plots_have_a_panel_for_each_parameter(found: driveby.Identif
     assert {axes.get_xlabel() for axes in posterior} == {"GN·m²"}
     low_gn, high_gn = posterior[3].get_xlim()
     assert len(posterior) == solution.bridge.elements
+    prior, above = (posterior[0].containers[n][0] for n in (0, 1))
+    assert prior.get_zorder() <= above.get_zorder()
+    assert above.get_alpha() < 0.9  # the prior behind it shows
     assert low_gn < solution.value["EI_4"].mean / 1e9 < high_gn
     chains = driveby.plot_chains(solution, ["rhoA", "EI_4"]).axes
     assert [axes.get_title(loc="left") for axes in chains] == ["rhoA", "EI_4"]
