@@ -20,6 +20,7 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity
 from schemas.topics import Key, parse_key, selector, topic
 from services.bus.liveness import LivenessProbe, StaleConnectionError
+from services.bus.presence import Presence
 from services.bus.session import checked_realm, wait_for_router
 from services.bus.subscription import RawSample, SeenSequences, subscribe_latest
 
@@ -160,6 +161,7 @@ class RealmListener:
             for owner, stream in _OTHERS
         ]
         self._elsewhere = OtherRealms(session, self.realm)
+        self._presence = Presence(session, self.realm)
         tokens = selector(self.realm, "vehicle", "alive")
         self._hearing = LivenessProbe(session, tokens, self._elsewhere.alive)
         self._is_open = True
@@ -174,11 +176,22 @@ class RealmListener:
         """Other realms and the trucks in them."""
         return self._elsewhere.trucks
 
+    @property
+    def lost_s(self) -> float | None:
+        """Steady time in s at which the connection was lost; None while it stands."""
+        return self._presence.lost_s
+
+    @property
+    def gone_s(self) -> dict[str, float]:
+        """Services of this realm that have left, each with the steady time in s."""
+        return self._presence.gone_s
+
     def heard(self) -> Iterator[BusMessage]:
         """Yield the messages since the last call, each once; return when there are none."""
         if not self._is_open:
             return
         self._elsewhere.look()
+        self._presence.look(time.monotonic())
         is_silent = True
         for stream in self._streams:
             for _ in range(_MAX_AT_ONCE):
@@ -215,6 +228,7 @@ class RealmListener:
         for stream in self._streams:
             stream.close()  # type: ignore[attr-defined]
         self._elsewhere.close()
+        self._presence.close()
 
     def _new(self, received: RawSample) -> BusMessage | None:
         """Return a message of the table that has not been received before, else None."""

@@ -34,10 +34,10 @@ _BEHIND_S: Final = 2.0
 """Steady age in s at arrival from which a clock is wrong: no network takes so long."""
 _OLD_S: Final = 60.0
 """Age in s at arrival from which samples are old."""
-_LATE_S: Final = 150.0
-"""Silence in s after which a service is unhealthy, as for `driveby health`."""
-_OLD_WORK_S: Final = 1.5 * HEALTH_PERIOD_S
-"""Silence in s after which the progress of a service is not shown: it may have been killed."""
+_LATE_S: Final = 1.5 * HEALTH_PERIOD_S
+"""Silence in s after which a service may have been killed: its progress is no longer shown."""
+_GONE_S: Final = 3.0
+"""Absence in s after which a service is silent; one whose router restarts connects again sooner."""
 _MAX_ALARMS: Final = 4
 """Maximum number of alarm lines at the head of a page, fewer on a low one."""
 _MAX_BRIDGES: Final = 4
@@ -58,6 +58,10 @@ class ListenerView(Protocol):
     def alive(self) -> set[str]: ...  # noqa: D102
     @property
     def elsewhere(self) -> dict[str, set[str]]: ...  # noqa: D102
+    @property
+    def lost_s(self) -> float | None: ...  # noqa: D102
+    @property
+    def gone_s(self) -> dict[str, float]: ...  # noqa: D102
 
 
 def page(
@@ -75,10 +79,14 @@ def page(
     trucks, rows = _sorted_trucks(model, now_s), model.rows()
     alarms = _alarms(model.alarms.values(), max(1, min(_MAX_ALARMS, height // 10)))
     taken = 11 + len(model.services) + 3 * min(len(model.bridges), _MAX_BRIDGES) + len(alarms)
-    taken += bool(model.bridges) and not alarms
+    taken += (bool(model.bridges) and not alarms) + (listening.lost_s is not None)
     room = max(8 - len(alarms), height - taken)
     most_trucks = max(2, min(len(trucks), room // 3))
-    parts: list[RenderableType] = [_headline(model, where, now_ns), *alarms]
+    parts: list[RenderableType] = [_headline(model, where, now_ns)]
+    if listening.lost_s is not None:
+        lost = f"connection to the router lost {_length(now_s - listening.lost_s)} ago"
+        parts.append(Text(lost, style="bold red", no_wrap=True, overflow="ellipsis"))
+    parts += alarms
     hint = other_realms_hint(listening.realm, listening.elsewhere)
     if not trucks and not rows:
         parts.append(Text(hint or "No trucks yet.", style="yellow" if hint else "dim"))
@@ -99,7 +107,8 @@ def page(
         standing = {name for name, one in model.alarms.items() if one.acknowledged is None}
         parts.append(_bridges(model.bridges, standing))
     if model.services:
-        parts.append(_services(model, now_ns))
+        silent = silent_services(model, listening, now_s, now_ns)
+        parts.append(_services(model, silent, now_ns, is_connected=listening.lost_s is None))
     spaced = [
         one for part in parts for one in ([Text()] if isinstance(part, Table) else []) + [part]
     ]
@@ -119,6 +128,23 @@ def bars(ratios: Sequence[float], weak: frozenset[int], *, doubtful: bool = Fals
 def silent_trucks(model: RealmModel, now_s: float) -> frozenset[str]:
     """Return the trucks that have been silent for a while."""
     return frozenset(n for n, truck in model.trucks.items() if now_s - truck.received_s > SILENT_S)
+
+
+def silent_services(
+    model: RealmModel, listening: ListenerView, now_s: float, now_ns: int
+) -> frozenset[str]:
+    """Return the services that have left without an end in order, or whose health is overdue.
+
+    Without a connection nothing is known of them: none is silent.
+    """
+    if listening.lost_s is not None:
+        return frozenset()
+    gone = {name for name, since_s in listening.gone_s.items() if now_s - since_s > _GONE_S}
+    return frozenset(
+        name
+        for name, one in model.services.items()
+        if not one.ended and (name in gone or (now_ns - one.time_ns) * 1e-9 > _LATE_S)
+    )
 
 
 def _sorted_trucks(model: RealmModel, now_s: float) -> list[tuple[str, TruckRow]]:
@@ -143,7 +169,8 @@ def _trucks(trucks: Sequence[tuple[str, TruckRow]], listening: ListenerView, now
         batches, fixes = truck.rates(now_s)
         state = Text("drives", style="green")
         if silent_s > SILENT_S:
-            there = "" if name in listening.alive else ", left"
+            is_known_there = name in listening.alive or listening.lost_s is not None
+            there = "" if is_known_there else ", left"
             state = Text(f"silent {_length(silent_s)}{there}", style="dim")
         hertz = "/".join(f"{rate:g}" for rate in sorted(set(truck.channels.values())))
         speed = "" if truck.speed_m_per_s is None else f"{truck.speed_m_per_s:.1f}"
@@ -266,7 +293,7 @@ def _alarms(alarms: Iterable[Alarm], most: int) -> list[Text]:
     return lines
 
 
-def _services(model: RealmModel, now_ns: int) -> Table:
+def _services(model: RealmModel, silent: Set[str], now_ns: int, *, is_connected: bool) -> Table:
     table = _table("service", "", "")
     for name, service in sorted(model.services.items()):
         age_s = (now_ns - service.time_ns) * 1e-9
@@ -274,11 +301,13 @@ def _services(model: RealmModel, now_ns: int) -> Table:
         if service.ended:
             how = "dim" if service.ok else "red"
             state = Text(f"ended {_length(age_s)} ago", style=how)
-        elif age_s > _LATE_S:
+        elif name in silent:
             state = Text(f"silent {_length(age_s)}", style="red")
+        elif not is_connected:
+            state = Text(f"unknown for {_length(age_s)}", style="dim")
         elif not service.ok:
             state = Text("not well", style="red")
-        work = "" if age_s > _OLD_WORK_S else model.work.get(name, "")
+        work = "" if name in silent or not is_connected else model.work.get(name, "")
         is_plain = service.ended and service.ok
         notes = ["" if is_plain else service_figures(service), work]
         table.add_row(name, state, "; ".join(one for one in notes if one))

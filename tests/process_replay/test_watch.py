@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from schemas.proto import driveby_pb2 as pb
 from schemas.results import ResultHeader
 from schemas.results_on_the_wire import crossing_to_protobuf
 from schemas.site_file import load_site
@@ -67,6 +68,27 @@ def test_lines_into_a_pipe(
         watch.send_signal(number)
         _, err = watch.communicate(timeout=LONGEST_S)
         assert (watch.returncode, err) == (0, "")
+    finally:
+        watch.kill()
+        watch.communicate()
+
+
+def test_killed_services_are_lines(start: Start, endpoint: str, tmp_path: Path) -> None:
+    logger = start_logger(start, endpoint, tmp_path / "live.mcap")
+    with open_session(connect=endpoint, timeout_s=LONGEST_S) as bus:
+        publisher = Publisher(bus, "live")
+        health = pb.Health(schema_version=1, time_ns=time.time_ns(), service="worker", ok=True)
+        publisher.put("service", "worker", "health", health.SerializeToString())
+        watch = subprocess.Popen([*COMMAND, endpoint], stdout=subprocess.PIPE, text=True)
+        assert watch.stdout is not None
+        lines = (output[9:].rstrip() for output in watch.stdout)
+        next(one for one in lines if one == "worker is well")
+    try:
+        next(one for one in lines if one == "worker is silent")
+        logger.kill()
+        next(one for one in lines if one == "connection to the router lost")
+        start_logger(start, endpoint, tmp_path / "again.mcap")
+        next(one for one in lines if one == "connected again")
     finally:
         watch.kill()
         watch.communicate()

@@ -86,12 +86,13 @@ def _print_lines(
     listening: "RealmListener", stop: threading.Event, write: Callable[[str], None]
 ) -> None:
     from services.bus.realm_listener import other_realms_hint
+    from services.cli.presence_lines import NOTHING_ABSENT, presence_lines
     from services.cli.realm_model import RealmModel
-    from services.cli.watch_page import NO_ALARM, silent_trucks
+    from services.cli.watch_page import NO_ALARM
 
     model = RealmModel()
     began_s = time.monotonic()
-    hinted, silent, is_monitoring_named = "", frozenset[str](), False
+    hinted, absent, is_monitoring_named = "", NOTHING_ABSENT, False
 
     def print_line(line: str | None) -> None:
         if line is not None:
@@ -102,10 +103,9 @@ def _print_lines(
             now_s = time.monotonic()
             print_line(model.ingest(heard, now_s, time.time_ns()))
         now_s = time.monotonic()
-        gone = silent_trucks(model, now_s)
-        for name in sorted(gone - silent):
-            print_line(f"{name} is silent")
-        silent = gone
+        absent, lines = presence_lines(absent, model, listening, now_s, time.time_ns())
+        for line in lines:
+            print_line(line)
         hint = other_realms_hint(listening.realm, listening.elsewhere) or ""
         is_empty = not model.trucks and not model.crossings
         if is_empty and hint != hinted and now_s - began_s > _HINT_AFTER_S:

@@ -16,6 +16,7 @@ from services.bus.realm_listener import BusMessage
 from services.cli import main as cli
 from services.cli import realm_model
 from services.cli.commands import watch
+from services.cli.presence_lines import NOTHING_ABSENT, presence_lines
 from services.cli.realm_model import RealmModel
 from services.cli.watch_page import NO_ALARM, bars, page, silent_trucks
 from tests.unit.cli.watching import (
@@ -214,6 +215,74 @@ def test_a_service_that_is_silent_or_unwell_stands_out() -> None:
     silent = line(drawn(watched), "worker")
     assert silent.startswith("worker silent 17 min")
     assert "validating" not in silent
+
+
+def test_overdue_service_is_silent() -> None:
+    watched = RealmModel()
+    deliver(watched, health("worker"))
+    row = watched.services["worker"]
+    for age_s, expected in ((89.0, "worker well"), (91.0, "worker silent 91 s")):
+        watched.services["worker"] = row._replace(time_ns=NOW_NS - round(age_s * 1e9))
+        assert line(drawn(watched), "worker") == expected
+
+
+def test_service_that_left_without_an_end_is_silent_at_once() -> None:
+    watched, listened = RealmModel(), Listened()
+    deliver(watched, health("worker"))
+    listened.gone_s = {"worker": NOW_S - 1.0}  # as long as the restart of a router takes
+    assert line(drawn(watched, listened=listened), "worker") == "worker well"
+    listened.gone_s = {"worker": NOW_S - 4.0}
+    assert line(drawn(watched, listened=listened), "worker") == "worker silent 12 s"
+    deliver(watched, health("worker", ended=True))
+    assert line(drawn(watched, listened=listened), "worker") == "worker ended 12 s ago"
+
+
+@pytest.mark.parametrize("height", [10, 40])
+def test_lost_connection_is_on_the_page(site: Site, height: int) -> None:
+    watched, listened = a_morning(site), Listened()
+    listened.lost_s, listened.gone_s = NOW_S - 7.0, {"worker": NOW_S - 7.0}
+    lines = drawn(watched, height=height, listened=listened)
+    assert lines[1] == "connection to the router lost 7.0 s ago"
+    if height == 40:
+        assert line(lines, "worker") == "worker unknown for 12 s queue 14"
+        assert line(lines, "truck-3").startswith("truck-3 silent 300 s 4 ×")
+    listened.lost_s = None
+    assert not any("lost 7" in one for one in drawn(watched, listened=listened))
+
+
+def test_lines_on_silent_services_and_the_connection() -> None:
+    watched, listened = RealmModel(), Listened()
+    absent = NOTHING_ABSENT
+    printed: list[str] = []
+
+    def look(now_s: float = NOW_S) -> None:
+        nonlocal absent
+        absent, lines = presence_lines(absent, watched, listened, now_s, NOW_NS)
+        printed.extend(lines)
+
+    deliver(watched, health("worker"))
+    look()
+    listened.lost_s = NOW_S
+    for _ in range(2):
+        look()
+    listened.lost_s, listened.gone_s = None, {"worker": NOW_S}
+    look(NOW_S + 1.0)
+    for _ in range(2):
+        look(NOW_S + 4.0)
+    listened.gone_s = {}
+    look(NOW_S + 5.0)
+    listened.gone_s = {"worker": NOW_S}
+    look(NOW_S + 9.0)
+    listened.gone_s = {}
+    deliver(watched, health("worker", queue=1.0))  # which is a line itself
+    look(NOW_S + 9.0)
+    assert printed == [
+        "connection to the router lost",
+        "connected again",
+        "worker is silent",
+        "worker is back",
+        "worker is silent",
+    ]
 
 
 def test_work_of_a_replaced_worker_is_not_shown() -> None:

@@ -27,6 +27,8 @@ class Listened:
         self.realm = realm
         self.alive = alive or set()
         self.elsewhere: dict[str, set[str]] = {}
+        self.lost_s: float | None = None
+        self.gone_s: dict[str, float] = {}
 
 
 def heard(owner: Any, name: str, stream: str, payload: bytes) -> BusMessage:
