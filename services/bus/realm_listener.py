@@ -19,6 +19,8 @@ from zenoh import handlers
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity
 from schemas.topics import Key, parse_key, selector, topic
+from services.bus.access_control import read_by
+from services.bus.credentials import check_credentials
 from services.bus.liveness import LivenessProbe, StaleConnectionError
 from services.bus.presence import Presence
 from services.bus.session import checked_realm, wait_for_router
@@ -276,6 +278,14 @@ def open_listener(
             yield heard
         finally:
             heard.close()
+
+
+def sees_trucks(tls: Path | None, realm: str) -> bool:
+    """Return whether credentials permit to read trucks' data; InputError for bad ones."""
+    if tls is None:
+        return True
+    wanted = zenoh.KeyExpr(selector(realm, "vehicle", _SIGNALS[0]))
+    return any(zenoh.KeyExpr(keys).intersects(wanted) for keys in read_by(check_credentials(tls)))
 
 
 def other_realms_hint(realm: str, elsewhere: dict[str, set[str]]) -> str | None:

@@ -123,9 +123,13 @@ class ServiceRow(NamedTuple):
 
 
 class RealmModel:
-    """State of one realm, of bounded size."""
+    """State of one realm, of bounded size.
 
-    def __init__(self) -> None:
+    `sees_trucks` is whether the credentials permit to read trucks' data.
+    """
+
+    def __init__(self, *, sees_trucks: bool = True) -> None:
+        self._sees_trucks = sees_trucks
         self.trucks: dict[str, TruckRow] = {}
         self.crossings: dict[str, CrossingRow] = {}
         """Crossings by identity, in the order of their first messages."""
@@ -204,7 +208,7 @@ class RealmModel:
     def _take_state(self, message: pb.Crossing, now_ns: int) -> str | None:
         truck = self.trucks.get(message.vehicle)
         lag_ns = 0 if truck is None else round(1e9 * truck.lag_s)
-        state = words_of_state(message, now_ns - lag_ns)
+        state = words_of_state(message, now_ns - lag_ns, sees_trucks=self._sees_trucks)
         row = self.crossings.get(message.crossing_id)
         if not state or (row is not None and (row.is_over or row.state == state)):
             return None

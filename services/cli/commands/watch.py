@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from services.bus.realm_listener import RealmListener
+    from services.cli.realm_model import RealmModel
 
 _PERIOD_S: Final = 0.25
 """Interval in s at which the page is drawn."""
@@ -39,7 +40,8 @@ def _watch(asked: WatchOptions) -> int:
     InputError: a bad realm, endpoint or credentials.
     """
     from services.bus.playback import leave_at_once, stopped_by_signals
-    from services.bus.realm_listener import open_listener
+    from services.bus.realm_listener import open_listener, sees_trucks
+    from services.cli.realm_model import RealmModel
 
     endpoint, console = asked.address, a_console()
     with (
@@ -48,22 +50,25 @@ def _watch(asked: WatchOptions) -> int:
     ):
         if heard is None:
             return 0
+        model = RealmModel(sees_trucks=sees_trucks(asked.tls, asked.realm))
         if console.is_terminal:
-            _show_page(heard, endpoint, stop, console)
+            _show_page(model, heard, endpoint, stop, console)
         else:
-            _print_lines(heard, stop, lambda line: print(line, flush=True))
+            _print_lines(model, heard, stop, lambda line: print(line, flush=True))
     return 0
 
 
 def _show_page(
-    listening: "RealmListener", endpoint: str, stop: threading.Event, console: "Console"
+    model: "RealmModel",
+    listening: "RealmListener",
+    endpoint: str,
+    stop: threading.Event,
+    console: "Console",
 ) -> None:
     from rich.live import Live
 
-    from services.cli.realm_model import RealmModel
     from services.cli.watch_page import page
 
-    model = RealmModel()
     with Live(console=console, auto_refresh=False, vertical_overflow="crop") as live:
         while not stop.is_set():
             for heard in listening.heard():
@@ -83,14 +88,15 @@ def _show_page(
 
 
 def _print_lines(
-    listening: "RealmListener", stop: threading.Event, write: Callable[[str], None]
+    model: "RealmModel",
+    listening: "RealmListener",
+    stop: threading.Event,
+    write: Callable[[str], None],
 ) -> None:
     from services.bus.realm_listener import other_realms_hint
     from services.cli.presence_lines import NOTHING_ABSENT, presence_lines
-    from services.cli.realm_model import RealmModel
     from services.cli.watch_page import NO_ALARM
 
-    model = RealmModel()
     began_s = time.monotonic()
     hinted, absent, is_monitoring_named = "", NOTHING_ABSENT, False
 

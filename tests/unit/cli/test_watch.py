@@ -2,6 +2,7 @@
 
 import io
 import threading
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -12,7 +13,7 @@ from schemas.results import BridgeResult
 from schemas.results_on_the_wire import bridge_to_protobuf
 from schemas.signals import Identity
 from schemas.site import Site
-from services.bus.realm_listener import BusMessage
+from services.bus.realm_listener import BusMessage, sees_trucks
 from services.cli import main as cli
 from services.cli import realm_model
 from services.cli.commands import watch
@@ -119,6 +120,21 @@ def test_crossing_found_in_a_recording_is_not_on_the_bridge() -> None:
     late = deliver(watched, state("c", pb.DETECTED, "truck-2", 190.0))
     assert late is not None
     assert late.endswith(": on the bridge")
+
+
+def test_without_trucks_data_no_crossing_is_from_a_recording() -> None:
+    """The credentials of a viewer do not show when the truck's samples were taken."""
+    watched = RealmModel(sees_trucks=False)
+    for entry, words in ((0.0, "detected"), (595.0, "on the bridge")):
+        found = deliver(watched, state(f"c-{entry}", pb.DETECTED, "truck-1", entry))
+        assert found is not None
+        assert found.endswith(f": {words}")
+
+
+def test_credentials_that_show_trucks(credentials: Path) -> None:
+    assert sees_trucks(None, "live")
+    assert sees_trucks(credentials / "worker", "live")
+    assert not sees_trucks(credentials / "viewer", "live")
 
 
 def test_entry_of_a_result_is_that_of_its_states(site: Site) -> None:
@@ -473,5 +489,5 @@ def test_lines_without_an_alarm_are_no_reassurance(
     for messages, expected in (([of_bridge], 1), ([of_bridge, alarm()], 0), ([], 0)):
         printed: list[str] = []
         listened = Batches([messages, []])
-        watch._print_lines(listened, listened.stop, printed.append)  # type: ignore[arg-type]
+        watch._print_lines(RealmModel(), listened, listened.stop, printed.append)  # type: ignore[arg-type]
         assert sum(one.endswith(NO_ALARM) for one in printed) == expected
