@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from schemas.events import Event, EventKind
 from schemas.topics import REALM, single_realm
@@ -101,11 +101,7 @@ class Housekeeping:
         code, out, log = done
         if code in (_EXIT_CLEAN, _EXIT_LOSSY):
             found = json.loads(out)
-            lost = "an unknown number" if found["lost"] is None else found["lost"]
-            text = (
-                f"{path.name} was cut off; {found['messages']} messages recovered to "
-                f"{recovered_path(path).name}, {lost} lost, {found['damaged_bytes']} bytes damaged"
-            )
+            text = recovery_text(path, found)
             self._report(path, EventKind.RECORDING_RECOVERED, text, found["messages"])
         elif code == _EXIT_BAD_INPUT and "holds nothing" in log:
             put_aside(path)
@@ -166,3 +162,18 @@ def _recordings(house: RetentionPolicy, *endings: str) -> Iterator[Path]:
         named = _REALM.fullmatch(realm) and _DATE.fullmatch(date)
         if named and path.name.endswith(endings) and path.is_file() and path.name[0] != ".":
             yield path
+
+
+def recovery_text(path: Path, found: dict[str, Any]) -> str:
+    """Return the result of a recovery, the JSON of `driveby recover`, in words."""
+    text = (
+        f"{path.name} was cut off; {found['messages']} messages recovered to "
+        f"{recovered_path(path).name}, {found['damaged_bytes']} bytes damaged"
+    )
+    if found["lost"] is not None:
+        return f"{text}, {found['lost']} lost"
+    return (
+        f"{text}; the end of the file is missing, with an unknown number of messages: by the "
+        "numbers of the trucks' messages, those that cannot be fetched again count as missing or "
+        "lost"
+    )
