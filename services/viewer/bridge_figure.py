@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.markers import CARETUP
 
 from services.common.arrays import Floats
 from services.common.language import ENGLISH, Language
@@ -43,6 +44,7 @@ from services.viewer.element_labels import (
     AFTER,
     BEFORE,
     anchors_clear_of,
+    change_texts,
     columns_gnm2,
     cut_height,
     draw_baseline,
@@ -58,6 +60,10 @@ _MAX_LISTED = 12
 _SIGNS = {"good": "●", "unused": "○", "suspect": "◇", "rejected": "×"}
 """Signs of good crossings, of unused good ones, and of the other verdicts, without colour."""
 _MARKERS = {"suspect": "D", "rejected": "X"}
+
+
+_STEM = 0.05
+"""Length of an arrow's line, relative to the height of its tip."""
 
 
 def bridge_figure(path: Path, bridge: BridgeView) -> None:
@@ -125,8 +131,10 @@ def _draw_state(axes: Axes, bridge: BridgeView, language: Language) -> float:
     drawn = [c for c in bridge.crossings if c.rigidity_nm2 is not None]
     dots = _dots(drawn, mean.size)
     resolved = [n for n in range(mean.size) if n + 1 not in bridge.unresolved]
-    highest = max(0.0, bridge.nominal_nm2.max() / 1e9, *dots[:, resolved].flat)
-    cut = cut_height(highest, columns, *(() if before is None else (before,)))
+    counts = np.array([_kind_of(bridge, one) == "good" for one in drawn[: len(dots)]], dtype=bool)
+    highest = max(0.0, bridge.nominal_nm2.max() / 1e9, *dots[counts][:, resolved].flat)
+    farthest = dots.max(initial=0.0)
+    cut = cut_height(highest, columns, *([] if before is None else [before]), farthest=farthest)
     places = bar_places(bridge.edges_m)
     if before is not None:
         places = bar_places(bridge.edges_m, *AFTER)
@@ -145,10 +153,12 @@ def _draw_state(axes: Axes, bridge: BridgeView, language: Language) -> float:
     colour = MUTED if bridge.is_doubtful else BAR_EDGE
     label = language.text("figure.interval")
     draw_intervals(axes, places, (low, high), colour=colour, label=label, cut=cut)
+    beyond = np.where(dots > cut, cut, np.nan)
     dots[dots > cut] = np.nan
-    _draw_crossings(axes, bridge, places, drawn, dots, language)
+    _draw_crossings(axes, bridge, places, drawn, (dots, beyond), language)
     ends = np.minimum(high, cut)
-    highest = min(cut, max(highest, float(ends.max()), *dots[dots > 0.0]))
+    drawn_to = (*dots[dots > 0.0], *beyond[beyond > 0.0])
+    highest = min(cut, max(highest, float(ends.max()), *drawn_to))
     return _label(axes, bridge, places, (mean, low, ends), dots, highest, language)
 
 
@@ -193,7 +203,7 @@ def _numbers(bridge: BridgeView, mean: Floats, language: Language) -> list[str]:
     """Return the number of each bar, all with one meaning."""
     if _meaning(bridge) == "change":
         assert bridge.comparison is not None  # noqa: S101 - its meaning says so
-        return [language.change(element.ratio) for element in bridge.comparison.elements]
+        return change_texts(bridge.comparison, language)
     return [language.number(ratio, ".3f") for ratio in mean / (bridge.nominal_nm2 / 1e9)]
 
 
@@ -202,16 +212,27 @@ def _draw_crossings(
     bridge: BridgeView,
     places: BarPlaces,
     drawn: list[CrossingView],
-    dots: Floats,
+    heights: tuple[Floats, Floats],
     language: Language,
 ) -> None:
-    """Draw the estimates (k, n) of single crossings next to the interval."""
+    """Draw the estimates (k, n) of single crossings next to the interval.
+
+    An arrow stands at the second height for an estimate that is beyond it.
+    """
+    dots, beyond = heights
     named: set[str] = set()
     shifts = np.linspace(-0.4, -0.26, len(dots))
-    for place, crossing, values in zip(shifts, drawn, dots, strict=False):
+    for place, crossing, values, ends in zip(shifts, drawn, dots, beyond, strict=False):
         kind = _kind_of(bridge, crossing)
+        at_m = places.centres_m + place * places.lengths_m
+        is_beyond = np.isfinite(ends)
+        if is_beyond.any():
+            from_m, tip = at_m[is_beyond], ends[is_beyond]
+            axes.vlines(from_m, (1.0 - _STEM) * tip, tip, color=INK, linewidth=1.2, zorder=9)
+            arrow: dict[str, Any] = {"linestyle": "none", "color": INK, "zorder": 9}
+            axes.plot(from_m, tip, marker=CARETUP, markersize=6.0, **arrow)
         axes.plot(
-            places.centres_m + place * places.lengths_m,
+            at_m,
             values,
             linestyle="none",
             marker=_MARKERS.get(kind, "o"),

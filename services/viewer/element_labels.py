@@ -13,7 +13,7 @@ from pre_core.constants import NORMAL_975
 from schemas.results import RESOLVED
 from services.common.arrays import Floats
 from services.common.language import ENGLISH, Language
-from services.identification.comparison import Estimate
+from services.identification.comparison import Comparison, Estimate
 from services.viewer.drawing import BASELINE_COLOUR, MUTED, BarPlaces
 
 _PLATE: dict[str, Any] = {
@@ -47,16 +47,18 @@ def columns_gnm2(estimate: Estimate) -> tuple[Floats, Floats, Floats]:
     return estimate.mean / 1e9, estimate.low / 1e9, estimate.high / 1e9
 
 
-def cut_height(highest: float, *intervals: tuple[Floats, Floats, Floats]) -> float:
+def cut_height(
+    highest: float, *intervals: tuple[Floats, Floats, Floats], farthest: float = 0.0
+) -> float:
     """Return the height at which intervals of unresolved elements are cut; infinite if none is.
 
-    One that is much longer than all others, and than `highest`, would leave no height to them. The
-    `intervals` are means and limits, all (n,).
+    One that is much longer than all others, and than `highest`, would leave no height to them; so
+    would a marker at `farthest`. The `intervals` are means and limits, all (n,).
     """
     for mean, low, high in intervals:
         is_resolved = high - low <= 2.0 * NORMAL_975 * RESOLVED * mean
         highest = max(highest, *high[is_resolved], 0.0)
-    longest = max(float(high.max()) for _, _, high in intervals)
+    longest = max(farthest, *(float(high.max()) for _, _, high in intervals))
     return _CUT * highest if longest > _LONG * highest else np.inf
 
 
@@ -125,6 +127,11 @@ def draw_baseline(
     draw_intervals(axes, places, (low, high), colour=BASELINE_COLOUR, label="", cut=cut)
 
 
+def change_texts(found: Comparison, language: Language = ENGLISH) -> list[str]:
+    """Return the change of each element, empty where none can be stated."""
+    return [language.change(one.ratio) if one.is_comparable else "" for one in found.elements]
+
+
 def label_losses(
     axes: Axes,
     places: BarPlaces,
@@ -151,9 +158,11 @@ def label_losses(
 def label_values(
     axes: Axes, places: BarPlaces, low: Floats, high: Floats, texts: Sequence[str]
 ) -> None:
-    """Write a number below each interval, or above where the bar is too low."""
+    """Write a number below each interval, or above where the bar is too low; none if empty."""
     above = _are_low(low, high)
     for number, (centre, text) in enumerate(zip(places.centres_m, texts, strict=True)):
+        if not text:
+            continue
         axes.annotate(
             text,
             (centre, high[number] if above[number] else low[number]),

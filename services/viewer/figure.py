@@ -49,6 +49,7 @@ from services.viewer.drawing import (
 from services.viewer.element_labels import (
     AFTER,
     BEFORE,
+    change_texts,
     columns_gnm2,
     cut_height,
     draw_baseline,
@@ -223,7 +224,7 @@ def _draw_estimate(
         texts = [f"{ratio:.3f}" for ratio in estimate / (crossing.nominal_nm2 / 1e9)]
         losses = {one.number: f"{100.0 * (1.0 - one.ratio):.0f} % less" for one in weak}
     else:  # the numbers themselves are the changes
-        texts, losses = [ENGLISH.change(one.ratio) for one in found.elements], {}
+        texts, losses = change_texts(found), {}
     label_values(axes, places, lowest, upper, texts)
     name_elements(axes, edges)
     label_losses(axes, places, lowest, upper, losses)

@@ -134,6 +134,32 @@ def test_labels_stay_at_their_interval_below_a_suspect_crossing(site: Site) -> N
         assert box.y0 < y + 20.0, text.get_text()
 
 
+def test_far_suspect_crossing_leaves_the_axis_to_the_others(site: Site) -> None:
+    view = with_suspect(site)
+    used, suspect = view.crossings
+    assert suspect.rigidity_nm2 is not None
+    far = suspect.rigidity_nm2 * np.array([1.0, 1.0, 1.0, 1.0, 12.0, 1.0, 1.0])
+    axes = draw_bridge(view._replace(crossings=(used, suspect._replace(rigidity_nm2=far)))).axes[0]
+    top = axes.get_ylim()[1]
+    assert top < 2.6 * 15.6  # of nominal; 12 times as high before
+    (diamonds,) = (line for line in axes.lines if line.get_marker() == "D")
+    drawn = np.isfinite(np.asarray(diamonds.get_ydata(), dtype=float))
+    (arrow,) = arrows(axes)
+    assert drawn.tolist() == [n != 4 for n in range(7)]
+    assert np.size(arrow.get_xdata()) == 1
+    assert 4.0 < np.max(arrow.get_xdata()) / site.bridges[0].span_m * 7.0 < 5.0
+    assert np.max(arrow.get_ydata()) < top
+
+
+def test_no_change_is_written_at_an_unresolved_element(site: Site) -> None:
+    axes = drawn_axes(site)["change"]
+    changes = [text for text in axes.texts if text.get_text().endswith("%")]
+    centres = [text.get_window_extent().x0 for text in changes]
+    (last,) = (text.get_window_extent().x0 for text in axes.texts if "7" in text.get_text())
+    assert len(changes) == 6
+    assert max(centres) < last - 50.0
+
+
 def test_suspect_crossing_has_one_sign_in_all_figures(site: Site) -> None:
     view = with_suspect(site)
     axes = draw_crossings(list(enumerate(view.crossings, start=1))).axes[0]
