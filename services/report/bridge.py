@@ -235,17 +235,21 @@ def _one_by_one(
         assert crossing.interval_nm2 is not None  # noqa: S101
         estimate = Estimate(crossing.rigidity_nm2, *crossing.interval_nm2.T)
         found.append(compare(estimate, view.nominal_nm2, view.edges_m, baseline))
-    number, elements, is_narrower = 0, list[str](), list[bool]()
+    number, elements, is_narrower, is_outside = 0, list[str](), list[bool](), False
     for weak in view.comparison.weak:
         losses = [1.0 - one.elements[weak.number - 1].ratio for one in found if one is not None]
         if len(losses) >= 2:
             number, text = len(losses), _range_of(losses, language)
             elements.append(language.text("losses.element", element=weak.number, losses=text))
             is_narrower.append(_is_narrower(view, good, weak.number - 1))
+            low, high = (round(100.0 * end) for end in (min(losses), max(losses)))
+            is_outside |= not low <= round(100.0 * (1.0 - weak.ratio)) <= high
     if elements:
         key = "single" if len(view.used) < 2 else "narrower" if all(is_narrower) else "wider"
         listed = language.listed(elements)
         yield language.text(f"finding.scatter.{key}", number=number, elements=listed)
+        if is_outside and len(view.used) > 1:
+            yield language.text("finding.scatter.outside")
 
 
 def _is_narrower(view: BridgeView, crossings: Sequence[CrossingView], n: int) -> bool:

@@ -296,6 +296,22 @@ def test_only_a_narrower_interval_is_called_more_precise(
     assert ("more precise" in text) == (spread < 0.01)
 
 
+def test_estimate_outside_the_range_of_single_ones_is_explained(site: Site) -> None:
+    """What crossings have in common is estimated once: the product is no mean of its factors."""
+    both = results_of(site, some_crossing("a"), some_crossing("b", entry=60.0), used="a")
+    for ratio, number in ((0.4, 0), (0.5, 1)):
+        ratios = RATIOS.copy()
+        ratios[3] = ratio
+        state = results_of(site, some_crossing("a"), used="a", ratios=ratios).bridges["bridge-1"]
+        state = state.model_copy(update={"crossings_used": ("a", "b")})
+        merged = both.model_copy(update={"bridges": {"bridge-1": state}})
+        text = reported(site, merged).text
+        assert "2 good crossings alone, element 4 is 60 % less stiff" in text
+        assert text.count("lies outside their range") == number
+        german = reported(site, merged, language="de").text
+        assert german.count("liegt außerhalb von deren Bereich") == number
+
+
 def test_an_element_that_seems_stiffer_is_a_warning_of_its_neighbours(
     site: Site, tmp_path: Path
 ) -> None:
