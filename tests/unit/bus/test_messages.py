@@ -75,4 +75,7 @@ def test_silence_is_explained_in_one_line(
         f"nothing received for 0 s on driveby/v1/*/service/*/health at {where}: "
         "nothing is published there"
     )
-    assert line.endswith("lacks viewer/viewer, see docs/security.md#changes") == is_secured
+    assert (
+        line.endswith("lacks viewer/viewer, which is new or revoked, see docs/security.md#changes")
+        == is_secured
+    )
