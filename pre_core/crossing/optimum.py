@@ -86,7 +86,7 @@ _WITHOUT_MISMATCH = (
     SearchStrategy(SWING_MODES - 1, True, 4, False),
     SearchStrategy(0, False, 4, False),
 )
-_WITH_MISMATCH = (SearchStrategy(SWING_MODES, True, 1, True), SearchStrategy(0, False, 4, True))
+WITH_MISMATCH = (SearchStrategy(SWING_MODES, True, 1, True), SearchStrategy(0, False, 4, True))
 """Strategies in the order of trial, the simplest first, until one ends at a fit: each superfluous
 freedom may mislead the search. Of 40 drawn crossings and 36 with unexpected bearings, spans or
 tyres the first found all but one, which the second did."""
@@ -147,7 +147,7 @@ def _run_strategies(
     """
     simplest = _SIMPLEST
     if has_tandem(problem):
-        simplest = _WITH_MISMATCH[0 if problem.crossing.lead.is_equalised else 1]
+        simplest = WITH_MISMATCH[0 if problem.crossing.lead.is_equalised else 1]
     budget = _Budget(max_evaluations, WORTH_COMPLETING_CHI2)
     found = [_refine_candidates(problem, y, simplest, report, budget)]
     if not _has_ended(found[0]):
@@ -174,7 +174,7 @@ def _other_strategies(fit: Optimum) -> tuple[tuple[SearchStrategy, ...], int]:
     tried. A suspension that is not linear resembles mismatch until its weight is reduced.
     """
     full_weight, reduced_weight = _WITHOUT_MISMATCH
-    strategies: tuple[SearchStrategy, ...] = (reduced_weight, *_WITH_MISMATCH, full_weight)
+    strategies: tuple[SearchStrategy, ...] = (reduced_weight, *WITH_MISMATCH, full_weight)
     if fit.stopped_by_mismatch or fit.stopped_by_friction or fit.problem.mismatch.level_m3.any():
         return strategies, 0
     alone = fit_off_bridge(fit)

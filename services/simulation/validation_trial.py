@@ -223,7 +223,7 @@ def one_crossing(
     """Draw, simulate and identify the crossing `number` of the site's only pair."""
     bridge = site.bridges[0]
     conditions = conditions_of(site.vehicles[0], bridge, site)
-    truth, weak = _truth(site, conditions, seed, number)
+    truth, weak = drawn_truth(site, conditions, seed, number)
     nominal = np.array(bridge.nominal_flexural_rigidity_nm2)
     went_in = {
         "seed": seed,
@@ -260,7 +260,7 @@ def _not_simulated(site: Site, seed: int) -> ValidationCrossing:
     )
 
 
-def _truth(
+def drawn_truth(
     site: Site, conditions: ValidationConditions, seed: int, number: int
 ) -> tuple[CrossingTruth, int | None]:
     """Return the truth of a crossing, and the index of its weak element, if any."""

@@ -11,12 +11,12 @@ from pre_core.crossing.frequency_continuation import (
     _starts,
     other_bridges,
 )
-from pre_core.crossing.optimum import _WITH_MISMATCH
+from pre_core.crossing.optimum import WITH_MISMATCH
 from pre_core.crossing.posterior import layout
 from pre_core.parameters import RHO_A
 from tests.numerics.single_tyres import at_its_truth
 
-STRATEGY = _WITH_MISMATCH[0]
+STRATEGY = WITH_MISMATCH[0]
 
 
 @pytest.fixture(scope="module")

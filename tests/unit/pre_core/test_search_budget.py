@@ -247,7 +247,7 @@ def test_other_trucks_are_tried_only_where_the_first_fails_off_the_bridge(
     strategies, used = optimum._other_strategies(found(5.0, 1))
     assert used == 10
     full_weight, reduced_weight = optimum._WITHOUT_MISMATCH
-    everything = (reduced_weight, *optimum._WITH_MISMATCH, full_weight)
+    everything = (reduced_weight, *optimum.WITH_MISMATCH, full_weight)
     assert strategies == ((full_weight,) if tried == "full weight" else everything)
 
 
