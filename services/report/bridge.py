@@ -32,6 +32,7 @@ from services.identification.comparison import (
 from services.report.cautions import CautionBasis, cautions
 from services.report.earlier import Before, SurveyFile, before_of, combined_surveys
 from services.report.quality import MAX_REASONS, quality, realm_of, reasons_of
+from services.report.repeats import newest_of_each, repeated
 from services.viewer.bridge_view import BridgeView, describe_bridge, view_of_bridge
 from services.viewer.crossing_view import CrossingView
 
@@ -87,12 +88,12 @@ def bridge_reports(
 ) -> list[BridgeReport]:
     """Return one report for each bridge that was crossed, in the order of the site files.
 
-    Of a crossing in several files the newest result counts. The numbers of a bridge are those of
-    the state with the newest crossing; if other files have good crossings of its realm that are not
-    in it, all are fused. `baseline` is a results file with which to compare; otherwise the one that
-    the site file names, whose folder is `beside` (default: that of the results). `validations` is
-    the folder of validation records. Raise InputError if a baseline does not fit, or results do not
-    fit their site file.
+    Of a crossing in several files the newest result counts (see `newest_of_each`). The numbers of a
+    bridge are those of the state with the newest crossing; if other files have good crossings of
+    its realm that are not in it, all are fused. `baseline` is a results file with which to compare;
+    otherwise the one that the site file names, whose folder is `beside` (default: that of the
+    results). `validations` is the folder of validation records. Raise InputError if a baseline does
+    not fit, or results do not fit their site file.
     """
     for path, results, site in files:
         _check(path, results, site)
@@ -130,9 +131,7 @@ def _report(
 ) -> BridgeReport:
     about = [f for f in files if any(c.bridge == name for c in f[1].crossings)]
     about.sort(key=lambda file: file[1].created)
-    newest: dict[str, CrossingResult] = {}
-    for _, results, _ in about:
-        newest.update((c.crossing_id, c) for c in results.crossings if c.bridge == name)
+    newest, repeats = newest_of_each(name, [results for _, results, _ in about])
     path, last, site = about[-1]
     crossings = tuple(sorted(newest.values(), key=lambda crossing: crossing.entry_time))
     state = _latest_state(name, [results for _, results, _ in about], newest)
@@ -160,7 +159,7 @@ def _report(
         site,
         before,
         _finding(view, crossings, stored, language),
-        " ".join((quality(view, crossings, language), *passed)),
+        " ".join((quality(view, crossings, language), *repeated(repeats, language), *passed)),
         tuple(cautions(basis, language)),
     )
 

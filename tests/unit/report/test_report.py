@@ -378,6 +378,31 @@ def test_several_surveys_are_fused_and_other_campaigns_are_named(site: Site) -> 
     assert "The numbers below combine 3 of them;" in text
 
 
+@pytest.mark.parametrize("is_later", [False, True])
+def test_crossing_of_two_realms_counts_once(site: Site, is_later: bool) -> None:
+    """It was exported and imported: its results carry one identifier."""
+    drives = losses_of({"bridge-1": None}, 1.79e9, 3)
+    state = fuse_bridge("bridge-1", drives.crossings)
+    assert state is not None
+    first = drives.model_copy(update={"bridges": {"bridge-1": state}})
+    twice = {
+        "crossings": _in_realm(drives.crossings[1:3], "import-drives"),
+        "created": drives.created + (1.0 if is_later else -1.0),
+        "bridges": {},
+    }
+    files = (first, drives.model_copy(update=twice))
+    text = reported(site, *files).text
+    assert "6 crossings: 6 good. All were simulated. The numbers below combine all 6" in text
+    assert "another campaign" not in text
+    names = ", ".join(one.crossing_id for one in drives.crossings[1:3])
+    own = drives.crossings[0].realm
+    assert (
+        "2 crossings are also in realm import-drives and are counted once, with their results "
+        f"of realm {own}: {names}." in text
+    )
+    assert "zählen einmal" in reported(site, *files, language="de").text
+
+
 def _in_realm(crossings: Sequence[CrossingResult], realm: str) -> tuple[CrossingResult, ...]:
     return tuple(one.model_copy(update={"realm": realm}) for one in crossings)
 
