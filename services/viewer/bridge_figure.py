@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,8 @@ _SIGNS = {"good": "●", "unused": "○", "suspect": "◇", "rejected": "×"}
 _MARKERS = {"suspect": "D", "rejected": "X"}
 
 
+_ROW_IN = 0.2
+"""Height of a line in the list of crossings."""
 _STEM = 0.05
 """Length of an arrow's line, relative to the height of its tip."""
 
@@ -80,11 +83,11 @@ def draw_bridge(
 
     The heading and the list are English.
     """
-    listed = min(len(bridge.crossings), _MAX_LISTED + 1) if with_heading else 0
+    listed = _listed(bridge) if with_heading else []
     lines = _heading(bridge) if with_heading else []
     heading_in = 1.35 + 0.17 * max(0, len(lines) - 2) if with_heading else 0.55
     # On a page of its own the width limits the size of its text.
-    panel_in, list_in = 3.6 if with_heading else 1.8, 0.2 * listed
+    panel_in, list_in = 3.6 if with_heading else 1.8, _ROW_IN * len(listed)
     list_in += 0.35 if listed else 0.0
     height = heading_in + panel_in + 0.5 + list_in
     figure = Figure(figsize=(WIDTH_IN, height), facecolor="white")
@@ -94,7 +97,7 @@ def draw_bridge(
     _draw_panel(axes, bridge, language)
     if with_heading:
         _draw_heading(figure, bridge, lines)
-        _list_crossings(figure, bridge, (list_in - 0.1) / height, 0.2 / height)
+        _list_crossings(figure, listed, (list_in - 0.1) / height, _ROW_IN / height)
     return figure
 
 
@@ -297,20 +300,26 @@ def _why_nothing(bridge: BridgeView) -> str:
     return "\n".join([*lines, *(f"• {text}" for text in list(reasons)[:6])])
 
 
-def _list_crossings(figure: Figure, bridge: BridgeView, top: float, step: float) -> None:
+def _listed(bridge: BridgeView) -> list[tuple[str, str]]:
+    """Return the lines of the list of crossings, each with its sign; the last may count others."""
     listed = bridge.crossings[-_MAX_LISTED:]
     more = len(bridge.crossings) - len(listed)
-    rows = [_row(bridge, crossing) for crossing in reversed(listed)]
-    for number, (sign, row) in enumerate(rows):
+    rows = [line for crossing in reversed(listed) for line in _rows(bridge, crossing)]
+    return rows + ([("", f"… and {more} earlier")] if more else [])
+
+
+def _list_crossings(
+    figure: Figure, listed: Sequence[tuple[str, str]], top: float, step: float
+) -> None:
+    for number, (sign, row) in enumerate(listed):
         y = top - number * step
+        colour = MUTED if row.startswith("…") else INK
         figure.text(LEFT, y, sign, fontsize=9, va="top")
-        figure.text(LEFT + 0.018, y, row, fontsize=8.5, va="top", color=INK, parse_math=False)
-    if more:
-        y = top - len(rows) * step
-        figure.text(LEFT + 0.018, y, f"… and {more} earlier", fontsize=8.5, va="top", color=MUTED)
+        figure.text(LEFT + 0.018, y, row, fontsize=8.5, va="top", color=colour, parse_math=False)
 
 
-def _row(bridge: BridgeView, crossing: CrossingView) -> tuple[str, str]:
+def _rows(bridge: BridgeView, crossing: CrossingView) -> list[tuple[str, str]]:
+    """Return the lines of a crossing with all of its reasons; the first has its sign."""
     moment = datetime.fromtimestamp(crossing.entry_time_s, UTC)
     way = "start to end" if crossing.forward else "end to start"
     used = ", used" if crossing.crossing_id in bridge.used else ""
@@ -319,4 +328,5 @@ def _row(bridge: BridgeView, crossing: CrossingView) -> tuple[str, str]:
         f"{moment:%Y-%m-%d %H:%M} UTC, {crossing.vehicle}, {way}, "
         f"{crossing.speed_m_per_s:.1f} m/s, {crossing.verdict}{used}{why}"
     )
-    return _SIGNS[_kind_of(bridge, crossing)], textwrap.shorten(line, width=116, placeholder=" …")
+    lines = textwrap.wrap(line, 116, subsequent_indent="    ")
+    return list(zip([_SIGNS[_kind_of(bridge, crossing)], *[""] * len(lines)], lines, strict=False))

@@ -45,6 +45,10 @@ _NOTES = {
 _SVG_METADATA = ("Date", "Creator", "Format", "Type")
 _CHARACTERS = 118
 """Maximum length of a line of reasons between the figure's edges."""
+_MAX_REASON_LINES = 6
+"""Maximum number of lines of reasons, more than three of the longest take."""
+REASON_LINE_IN = 0.15
+"""Height of a line of reasons."""
 _BESIDE_VERDICT = 110
 """Maximum length of a finding next to the word of a good verdict."""
 _OMITTED = " …"
@@ -133,7 +137,8 @@ def draw_verdict(
             short: dict[str, Any] = {"fontsize": 8.3, "va": "top", "parse_math": False}
             figure.text(LEFT + 0.12, top, _beside_verdict(sentences), color=INK, **short)
         return
-    height = 0.40 / figure.get_figheight()
+    lines = reason_lines(verdict, reasons)
+    height = (0.40 + REASON_LINE_IN * (len(lines) - 1)) / figure.get_figheight()
     figure.add_artist(
         FancyBboxPatch(
             (LEFT + 0.004, top - height + 0.004),
@@ -149,9 +154,17 @@ def draw_verdict(
     top -= 0.055 / figure.get_figheight()
     figure.text(LEFT + 0.01, top, f"verdict: {verdict}", fontweight="bold", color=INK, **words)
     figure.text(LEFT + 0.16, top, _NOTES[verdict], color=INK, **words)
-    text = textwrap.shorten(" ".join(reasons), width=_CHARACTERS, placeholder=" …")
-    top -= 0.165 / figure.get_figheight()
+    text, top = "\n".join(lines), top - 0.165 / figure.get_figheight()
     figure.text(LEFT + 0.01, top, text, fontsize=8.5, color=INK, va="top", parse_math=False)
+
+
+def reason_lines(verdict: str, reasons: Sequence[str]) -> list[str]:
+    """Return the lines of a banner's reasons, at least one.
+
+    Without an estimate there is one line: all reasons stand in place of the panel.
+    """
+    most = 1 if verdict == "rejected" else _MAX_REASON_LINES
+    return textwrap.wrap(" ".join(reasons), _CHARACTERS, max_lines=most, placeholder=" …") or [""]
 
 
 def shortened(sentence: str, width: int) -> str:

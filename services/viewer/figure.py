@@ -32,6 +32,7 @@ from services.viewer.drawing import (
     LEFT,
     MUTED,
     NOMINAL_LINE,
+    REASON_LINE_IN,
     RIGHT,
     STYLE,
     TRUTH_MARKER,
@@ -42,6 +43,7 @@ from services.viewer.drawing import (
     draw_verdict,
     legend_beside_title,
     mark_bridge,
+    reason_lines,
     simplify_axes,
     write_centred,
     write_figure,
@@ -112,8 +114,10 @@ def draw_crossing(
     has_road = crossing.road is not None or road_truth is not None
     height_in = HEIGHT_IN if has_road else _HEIGHT_WITHOUT_ROAD_IN
     heading_in = _HEADING_IN
-    if crossing.verdict != "good":  # the banner has two lines
-        height_in, heading_in = height_in + _BANNER_IN, heading_in + _BANNER_IN
+    if crossing.verdict != "good":  # the banner has two lines or more
+        more = len(reason_lines(crossing.verdict, crossing.reason_texts)) - 1
+        banner_in = _BANNER_IN + REASON_LINE_IN * more
+        height_in, heading_in = height_in + banner_in, heading_in + banner_in
     if _is_change(comparison_of(crossing, baseline)):  # the title is above the legend
         height_in, heading_in = height_in + _LEGEND_IN, heading_in + _LEGEND_IN
     figure = Figure(figsize=(WIDTH_IN, height_in), facecolor="white")

@@ -84,6 +84,22 @@ def test_what_is_doubtful_looks_doubtful(site: Site) -> None:
         assert_words_apart(figure)
 
 
+def test_all_reasons_of_a_suspect_crossing_can_be_read(site: Site) -> None:
+    why = ("position_outage", "residuals_coloured", "implausible_bridge")
+    doubtful = some_crossing("a", verdict="suspect", reasons=why)
+    crossing = results_of(site, doubtful).crossings[0]
+    view = view_of_crossing(crossing, site.bridges[0])
+    for figure in (
+        draw_crossing(view, element_truth=None, road_truth=None),
+        draw_bridge(bridge_of(site, doubtful, some_crossing("b"), used="b")),
+    ):
+        text = " ".join(written(figure).split())
+        for sentence in crossing.reason_texts:
+            assert sentence in text
+        assert "…" not in text
+        assert_words_apart(figure)
+
+
 def test_a_rejected_crossing_says_why_and_shows_no_empty_panel(site: Site) -> None:
     why = ("model_misfit", "not_converged", "implausible_vehicle")
     crossing = results_of(site, some_crossing("a", verdict="rejected", reasons=why)).crossings[0]
