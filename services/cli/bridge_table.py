@@ -145,6 +145,12 @@ def print_elements(
     """
     from rich.table import Table
 
+    every = [elements[f"EI_{n}"] for n in range(1, len(bridge.lengths_m) + 1)]
+    bounds = [one.q975 if has_meaning else one.mean for one in every]
+    ratios = [
+        b / sound for b, sound in zip(bounds, bridge.nominal_flexural_rigidity_nm2, strict=True)
+    ]
+    digits_of_ei, digits_of_ratio = _digits(max(bounds) / 1e9, 2), _digits(10.0 * max(ratios), 3)
     table = Table(box=None, pad_edge=False)
     for heading in ("element", "from (m)", "to (m)", "EI (GN·m²)"):
         table.add_column(heading, justify="right")
@@ -162,7 +168,7 @@ def print_elements(
     ):
         p = elements[f"EI_{number}"]
         row = [f"EI_{number}", f"{start:.2f}", f"{start + length:.2f}"]
-        for unit, digits in ((1e9, 2), (sound, 3)):
+        for unit, digits in ((1e9, digits_of_ei), (sound, digits_of_ratio)):
             row.append(f"{p.mean / unit:.{digits}f}")
             if has_meaning and not (losses and unit == sound):
                 row.append(f"{p.q025 / unit:.{digits}f} … {p.q975 / unit:.{digits}f}")
@@ -173,3 +179,12 @@ def print_elements(
         table.add_row(*row)
         start += length
     console.print(table)
+
+
+def _digits(largest: float, usual: int) -> int:
+    """Return how many decimals leave values of a column as long as `usual` ones below 100.
+
+    Longer ones would break intervals in a line of 80 characters.
+    """
+    longer = max(0, len(f"{largest:.0f}") - 2)
+    return max(0, usual - longer)

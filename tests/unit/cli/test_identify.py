@@ -25,7 +25,7 @@ from schemas.site_file import parse_site, site_hash, site_toml
 from schemas.topics import Message
 from schemas.validation_records import VehicleBridgePair, pair_hash
 from services.cli import main as cli
-from services.cli.bridge_table import print_bridge
+from services.cli.bridge_table import print_bridge, print_elements
 from services.cli.identify import _print, identify_command, print_validation
 from services.cli.settings import IdentifyOptions
 from services.common.errors import InputError
@@ -48,7 +48,7 @@ from services.simulation.drive import (
 )
 from tests.builders.certificates import certificate
 from tests.identifications import identify_recordings
-from tests.unit.viewer.found import results_of, some_crossing
+from tests.unit.viewer.found import RATIOS, results_of, some_crossing
 
 SOUND_NM2 = 1.56e10
 LEAST_SQUARES = IdentificationSettings(method="least_squares")
@@ -486,6 +486,20 @@ def test_fused_state_names_the_remedy_of_its_reasons(capsys: pytest.CaptureFixtu
     print_bridge(Console(width=200), site.bridges[0], state.model_copy(update=reasons))
     remedy = ENGLISH.bridge_advice["uses_suspect"]
     assert f"  uses_suspect: A.\n    {remedy}\n" in capsys.readouterr().out
+
+
+def test_intervals_of_a_stiff_bridge_stay_on_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    site = paper_site()
+    ratios = RATIOS.copy()
+    ratios[4] = 31.0
+    state = results_of(site, some_crossing("a"), used="a", ratios=ratios).bridges["bridge-1"]
+    losses = {f"EI_{n}": {"10": 0.98, "20": 0.95, "30": 0.9} for n in range(1, 8)}
+    for given in (None, losses):
+        print_elements(Console(width=80), site.bridges[0], state.elements, True, given)
+        lines = capsys.readouterr().out.splitlines()
+        rows = [line for line in lines if line.lstrip().startswith("EI_")]
+        assert len(rows) == len(lines) - (1 if given is None else 2)
+        assert all(row.count("…") == (2 if given is None else 1) for row in rows)
 
 
 def test_bridge_without_site_validation_has_one_line(
