@@ -7,7 +7,7 @@ from services.cli.watch_page import ListenerView, silent_services, silent_trucks
 
 
 class Absent(NamedTuple):
-    """What is silent."""
+    """Trucks and services that are silent."""
 
     trucks: frozenset[str]
     services: dict[str, ServiceRow]

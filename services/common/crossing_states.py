@@ -8,7 +8,7 @@ ON_BRIDGE: Final = "on the bridge"
 FROM_RECORDING: Final = "from a recording"
 """State of a detected crossing whose truck has left the bridge long ago."""
 DETECTED: Final = "detected"
-"""State of a detected crossing of which nobody here can tell whether its truck is there."""
+"""State of a detected crossing of which it is unknown whether its truck is there."""
 _LATE_S: Final = 60.0
 """Time in s since an entry, on the truck's clock, after which it is found in a recording."""
 _WORDS: Final = {
