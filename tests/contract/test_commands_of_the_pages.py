@@ -73,6 +73,7 @@ NOT_RUN = {
     "pytest tests/faults/test_cluster.py": ITSELF,
     'pip install -e ".[opensees]"': NETWORK,
     "python -m tests.benchmarks.cluster_scale --crossings 2000": LONG,
+    "python -m studies.scripts.local_minima": LONG,
     "make install": "installs what this test runs in; .ci/run begins with it",
     "make demo": "tests/process_replay/test_demo.py runs the command of the target",
     "make test": ITSELF,
