@@ -1,9 +1,9 @@
 """Search for other bridges by low frequencies first.
 
 A bridge that vibrates at a wrong frequency is a local minimum: its oscillation slips by a period
-against the measured one, and each small change fits worse. Similar profiles of both axles (equal
-tyres, tandems) leave so little noise that a quarter of the searches ended there, up to 300 in the
-log posterior below the true bridge, and fitted. Below the first frequency the deflection is nearly
+against the measured one, and each small change fits worse. Equal tyres on both axles leave so
+little noise that a quarter of the searches ended there, up to 350 in the log posterior below the
+true bridge, and fitted. Below the first frequency the deflection is nearly
 static: linear in the compliances of elements and bearings. So bridges are fitted to the residuals
 below a frequency that is doubled stage by stage, each of which brings the next oscillation within
 half a period (frequency continuation, as in seismic inversion: Bunks, Saleck, Zaleski and Chavent

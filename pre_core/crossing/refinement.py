@@ -12,7 +12,7 @@ from pre_core.crossing.fit import (
 )
 from pre_core.crossing.frequency_continuation import other_bridges
 from pre_core.crossing.mismatch import has_alike_tyres
-from pre_core.crossing.posterior import layout
+from pre_core.crossing.posterior import has_tandem, layout
 from pre_core.crossing.walk import better_neighbour, shifted_to
 
 _CLEAR_RESTRAINT = 0.5
@@ -32,10 +32,15 @@ def refined(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> t
 
 
 def _is_sharp(found: Optimum) -> bool:
-    """Return whether bridges of other frequencies are tried: similar profiles, and nearly a fit."""
+    """Return whether bridges of other frequencies are tried: equal tyres, and nearly a fit.
+
+    Of a tandem the whole reach of the receiver was scanned; four searches found no other bridge, by
+    40 % more evaluations.
+    """
     mismatch = found.problem.mismatch
     is_sharp = mismatch.level_m3.any() and has_alike_tyres(mismatch)
-    return bool(is_sharp and found.unfinished is None and found.chi2_per_dof <= HOPELESS_CHI2)
+    is_tried = is_sharp and not has_tandem(found.problem)
+    return bool(is_tried and found.unfinished is None and found.chi2_per_dof <= HOPELESS_CHI2)
 
 
 def _with_other_bridge(

@@ -179,6 +179,33 @@ def test_other_bridges_are_tried_until_two_sets_of_starts_fail(
 
 
 @pytest.mark.parametrize(
+    ("twin_m", "tandem", "level", "chi2", "is_tried"),
+    [
+        (0.0, False, 1.0, 1.0, True),
+        (0.33, False, 1.0, 1.0, False),
+        (0.0, True, 1.0, 1.0, False),
+        (0.0, False, 0.0, 1.0, False),
+        (0.0, False, 1.0, 26.0, False),
+    ],
+)
+def test_other_bridges_are_tried_under_equal_tyres_only(
+    twin_m: float,
+    tandem: bool,
+    level: float,
+    chi2: float,
+    is_tried: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    footprints = (SimpleNamespace(twin_distance_m=0.0), SimpleNamespace(twin_distance_m=twin_m))
+    mismatch = SimpleNamespace(
+        level_m3=np.array([level]), shapes=SimpleNamespace(footprints=footprints)
+    )
+    monkeypatch.setattr(refinement, "has_tandem", lambda _: tandem)
+    one = found(chi2, 1)._replace(problem=SimpleNamespace(mismatch=mismatch))
+    assert refinement._is_sharp(one) is is_tried
+
+
+@pytest.mark.parametrize(
     ("chi2", "force", "starts"),
     [
         ((201.0, 1.0), 1.0, 1),
