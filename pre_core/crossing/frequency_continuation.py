@@ -3,11 +3,11 @@
 A bridge that vibrates at a wrong frequency is a local minimum: its oscillation slips by a period
 against the measured one, and each small change fits worse. Equal tyres on both axles leave so
 little noise that a quarter of the searches ended there, up to 350 in the log posterior below the
-true bridge, and fitted. Below the first frequency the deflection is nearly
-static: linear in the compliances of elements and bearings. So bridges are fitted to the residuals
-below a frequency that is doubled stage by stage, each of which brings the next oscillation within
-half a period (frequency continuation, as in seismic inversion: Bunks, Saleck, Zaleski and Chavent
-1995). Truck and trajectory follow to first order, but for the offset.
+true bridge, and fitted. Below the first frequency the deflection is nearly static: linear in the
+compliances of elements and bearings. So bridges are fitted to the residuals below a frequency that
+is doubled stage by stage, each of which brings the next oscillation within half a period (frequency
+continuation, as in seismic inversion: Bunks, Saleck, Zaleski and Chavent 1995). Truck and
+trajectory follow to first order, but for the offset.
 """
 
 from collections.abc import Iterator
@@ -26,12 +26,13 @@ from pre_core.crossing.fit import (
     resting_mode_indices,
     tempered_residuals,
 )
+from pre_core.crossing.nuisances import place_of_offset
 from pre_core.crossing.pavement import known_pavement
 from pre_core.crossing.posterior import PosteriorProblem, layout
 from pre_core.crossing.preparation import update_noise
 from pre_core.crossing.rows import RESIDUALS
+from pre_core.crossing.walk import others_effects
 from pre_core.parameters import K_ROT, F
-from pre_core.search import levenberg_marquardt
 from pre_core.search.levenberg_marquardt import minimise
 
 _STAGES_HZ = (1.5, 3.0, 6.0, 12.0, 24.0)
@@ -109,7 +110,7 @@ def other_bridges(
     ]
     tried = sorted((fit.run(start, stages) for start, stages in starts), key=_objective)
     distinct = [here]
-    for one in sorted(tried, key=_objective):
+    for one in tried:
         moves = [np.abs(one.y - other.y)[[*at.places, -1]].max() for other in distinct]
         if one.objective < here.objective - _ENOUGH and min(moves) > _SAME_BRIDGE:
             distinct.append(one)
@@ -165,13 +166,10 @@ class _ContinuedFit:
         where = layout(problem)
         self.evaluations = y.size + 1
         self._at, self._y, self._where = at, y, where
-        jacobian = levenberg_marquardt.initial_state(
-            tempered_residuals(problem, y, np.eye(y.size), 1.0), np.zeros(y.size)
-        ).jacobian
         # The offset moves the whole trajectory, whose other coordinates are relative to one.
-        middle = (where.trajectory.start + where.trajectory.stop) // 2
-        held = np.concatenate([at.places, resting_mode_indices(problem, strategy), [middle]])
-        self._others, _ = np.linalg.qr(np.delete(jacobian, held, axis=1))
+        offset = place_of_offset(problem)
+        held = np.concatenate([at.places, resting_mode_indices(problem, strategy), [offset]])
+        self._others = others_effects(problem, y, held, 1.0)
         directions = np.zeros((y.size, at.places.size + 1))
         directions[at.places, np.arange(at.places.size)] = 1.0
         directions[where.trajectory, -1] = 1.0
@@ -184,9 +182,8 @@ class _ContinuedFit:
 
     def objective(self, start: FloatArray) -> float:
         """Return the sum of squares at coordinates (n + 1,) in y."""
-        rows = self._rows(start[None, :])
         self.evaluations += 1
-        return float(np.sum((rows - (rows @ self._others) @ self._others.T) ** 2))
+        return float(np.sum(self._residuals(start[None, :]) ** 2))
 
     def run(self, start: FloatArray, stages_hz: tuple[float, ...]) -> OtherBridge:
         """Return the bridge fitted below each of the frequencies, and at last to all."""
@@ -199,14 +196,18 @@ class _ContinuedFit:
         y[self._where.trajectory] += moved[-1]
         return OtherBridge(objective, y)
 
+    def _residuals(self, moved: FloatArray) -> FloatArray:
+        """Return residuals (k, rows) at coordinates (k, n + 1) in y that no other one explains."""
+        rows = self._rows(moved)
+        return np.asarray(rows - (rows @ self._others) @ self._others.T)
+
     def _stage(self, u: FloatArray, up_to_hz: float, steps: int) -> tuple[FloatArray, float]:
         """Return the coordinates fitted to mismatch residuals below a frequency, and squares."""
 
         def residuals(points: FloatArray) -> FloatArray:
-            rows = self._rows(self._at.to_y(points))
-            rows = rows - (rows @ self._others) @ self._others.T
+            rows = self._residuals(self._at.to_y(points))
             if np.isinf(up_to_hz):
-                return np.asarray(rows)
+                return rows
             waves = max(_FEWEST_WAVES, int(self._waves_per_hz * up_to_hz))
             low = dct(rows[:, : self._data : RESIDUALS], axis=1, norm="ortho")[:, :waves]
             return np.hstack([low, rows[:, self._data :]])

@@ -60,16 +60,25 @@ LocalFit = Callable[[float, FloatArray], tuple[Placement, int]]
 """Function that returns the candidate at a shift in m from a start, and its evaluations."""
 
 
+def others_effects(
+    problem: PosteriorProblem, y: FloatArray, held: NDArray[np.int64], temperature: float
+) -> FloatArray:
+    """Return an orthonormal basis (rows, f - h) of what all coordinates but `held` (h,) affect.
+
+    It is that of the residuals' derivatives at y (f,), which take f + 1 evaluations.
+    """
+    rows = tempered_residuals(problem, y, np.eye(y.size), temperature)
+    here = levenberg_marquardt.initial_state(rows, np.zeros(y.size))
+    return np.asarray(np.linalg.qr(np.delete(here.jacobian, held, axis=1))[0])
+
+
 def _local_fit(problem: PosteriorProblem, y: FloatArray, strategy: SearchStrategy) -> LocalFit:
     """Return a fit of the bridge alone at an offset, everything else to first order about y."""
     where = layout(problem)
     places = where.bridge
     free = np.eye(y.size)
-    here = levenberg_marquardt.initial_state(
-        tempered_residuals(problem, y, free, _WALK_TEMPERATURE), np.zeros(y.size)
-    ).jacobian
     held = np.union1d(places, resting_mode_indices(problem, strategy))
-    others, _ = np.linalg.qr(np.delete(here, held, axis=1))
+    others = others_effects(problem, y, held, _WALK_TEMPERATURE)
 
     def fit_at(shift: float, start: FloatArray) -> tuple[Placement, int]:
         moved = y.copy()

@@ -214,7 +214,7 @@ def top_above_labels(axes: Axes, low: Floats, high: Floats, labelled: Iterable[i
 
 
 class Anchors(NamedTuple):
-    """Where the labels of intervals stand, all (n,)."""
+    """Places of the labels of intervals, all (n,)."""
 
     places: BarPlaces
     floor: Floats
