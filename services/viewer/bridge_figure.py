@@ -51,10 +51,7 @@ from services.viewer.element_labels import (
     draw_baseline,
     draw_intervals,
     end_with_names,
-    label_losses,
-    label_values,
-    name_elements,
-    top_above_labels,
+    label_elements,
 )
 
 _MAX_LISTED = 12
@@ -176,8 +173,7 @@ def _label(
 ) -> float:
     """Write numbers, losses and names of elements; return the axis' end."""
     mean, low, ends = columns
-    places, floor, tops = anchors_clear_of(axes, places, (low, ends), dots, 1.1 * highest)
-    label_values(axes, places, floor, tops, _numbers(bridge, mean, language))
+    anchors = anchors_clear_of(axes, places, (low, ends), dots, 1.1 * highest)
     losses = {}
     weak = () if bridge.comparison is None else bridge.comparison.weak
     if _meaning(bridge) == "ratio":  # otherwise the numbers themselves are the changes
@@ -185,9 +181,8 @@ def _label(
             element.number: language.text("figure.less", loss=100.0 * (1.0 - element.ratio))
             for element in weak
         }
-    label_losses(axes, places, floor, tops, losses)
-    name_elements(axes, bridge.edges_m)
-    return max(1.1 * highest, top_above_labels(axes, floor, tops, losses))
+    texts = _numbers(bridge, mean, language)
+    return label_elements(axes, bridge.edges_m, anchors, texts, losses, highest)
 
 
 def _dots(drawn: list[CrossingView], elements: int) -> Floats:

@@ -132,7 +132,26 @@ def change_texts(found: Comparison, language: Language = ENGLISH) -> list[str]:
     return [language.change(one.ratio) if one.is_comparable else "" for one in found.elements]
 
 
-def label_losses(
+def label_elements(
+    axes: Axes,
+    edges_m: Floats,
+    anchors: Anchors,
+    texts: Sequence[str],
+    losses: Mapping[int, str],
+    highest: float,
+) -> float:
+    """Write number, loss and name of each element; return the axis' end, above `highest`, too.
+
+    `texts` (n,) are the numbers, empty for none; `losses` are by element, from 1.
+    """
+    places, floor, tops = anchors
+    _label_values(axes, places, floor, tops, texts)
+    _label_losses(axes, places, floor, tops, losses)
+    name_elements(axes, edges_m)
+    return max(1.1 * highest, _top_above_labels(axes, floor, tops, losses))
+
+
+def _label_losses(
     axes: Axes,
     places: BarPlaces,
     low: Floats,
@@ -155,7 +174,7 @@ def label_losses(
         )
 
 
-def label_values(
+def _label_values(
     axes: Axes, places: BarPlaces, low: Floats, high: Floats, texts: Sequence[str]
 ) -> None:
     """Write a number below each interval, or above where the bar is too low; none if empty."""
@@ -200,7 +219,7 @@ def end_with_names(axes: Axes, highest: float) -> float:
     return highest / (1.0 - _NAMES_PT / _height_pt(axes))
 
 
-def top_above_labels(axes: Axes, low: Floats, high: Floats, labelled: Iterable[int] = ()) -> float:
+def _top_above_labels(axes: Axes, low: Floats, high: Floats, labelled: Iterable[int] = ()) -> float:
     """Return the height of a vertical axis from 0 below which all labels above intervals stay.
 
     `labelled` are the numbers of the elements with a loss above their interval.

@@ -51,16 +51,14 @@ from services.viewer.drawing import (
 from services.viewer.element_labels import (
     AFTER,
     BEFORE,
+    Anchors,
     change_texts,
     columns_gnm2,
     cut_height,
     draw_baseline,
     draw_intervals,
     end_with_names,
-    label_losses,
-    label_values,
-    name_elements,
-    top_above_labels,
+    label_elements,
 )
 
 HEIGHT_IN = 7.1
@@ -229,11 +227,9 @@ def _draw_estimate(
         losses = {one.number: f"{100.0 * (1.0 - one.ratio):.0f} % less" for one in weak}
     else:  # the numbers themselves are the changes
         texts, losses = change_texts(found), {}
-    label_values(axes, places, lowest, upper, texts)
-    name_elements(axes, edges)
-    label_losses(axes, places, lowest, upper, losses)
     highest = max(highest, float(upper.max()))
-    return max(1.1 * highest, top_above_labels(axes, lowest, upper, losses))
+    anchors = Anchors(places, lowest, upper)
+    return label_elements(axes, edges, anchors, texts, losses, highest)
 
 
 def _draw_profiles(axes: Axes, crossing: CrossingView, truth: tuple[Floats, Floats] | None) -> None:
