@@ -81,7 +81,7 @@ def realm_option(group: str = "") -> Any:
 
 def tls_option(group: str = "") -> Any:
     """Return `--tls`: a folder of credentials."""
-    address = f"the default address is {DEFAULT_TLS_ENDPOINT} then"
+    address = f"the default address is then {DEFAULT_TLS_ENDPOINT}"
     text = f"credentials made by `driveby certs`; {address}"
     return opt(text, Path, group=group, metavar="FOLDER")
 
@@ -201,7 +201,7 @@ def baseline_option() -> Any:
 
 def fuse_suspect_option() -> Any:
     """Return `--fuse-suspect`."""
-    return flag("fuse suspect crossings too; the bridge's estimate is suspect then")
+    return flag("fuse suspect crossings too; the bridge's estimate is then suspect")
 
 
 def option_of(name: str) -> str:

@@ -35,8 +35,8 @@ class ImportOptions:
     )
     vehicle: str | None = opt("identifier of the site's vehicle that drove", metavar="ID")
     realm: str | None = opt(
-        "name of the realm, import-NAME, which the drives of one campaign share (default: "
-        "[import] name of the site file, else drives)",
+        "name in the realm import-NAME, which the drives of one campaign share (default: name in "
+        "[import] of the site file, else drives)",
         metavar="NAME",
     )
     preview: bool = flag(

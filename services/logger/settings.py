@@ -59,16 +59,16 @@ class LoggerSettings:
         metavar="MB",
     )
     min_free: float = opt(
-        "least free disk space in MB for a start; below it health is not ok, below an eighth of it"
-        " recording stops (default: 500)",
+        "minimum free disk space in MB to start; below it health is not ok, below an eighth of it "
+        "recording stops (default: 500)",
         number("a size in MB", low=0, high=1e9),
         group=_ROOM,
         default=500.0,
         metavar="MB",
     )
     budget: float | None = opt(
-        "limit of disk space for recordings; the oldest whose crossings are all identified "
-        "are deleted beyond it (default: delete nothing)",
+        "limit of disk space in MB for recordings; beyond it the oldest of those whose "
+        "crossings are all identified are deleted (default: delete nothing)",
         number("a size in MB", low=1, high=1e9),
         group=_ROOM,
         metavar="MB",

@@ -50,7 +50,7 @@ class ReplaySettings(OnTheBus):
         "end, given as for --start", group="time", alternatives="end", metavar="S|TIME"
     )
     duration: float | None = opt(
-        "duration in seconds of the drive",
+        "length in s of the part of the drive to replay",
         number("seconds", low=1e-3, high=1e9),
         group="time",
         alternatives="end",

@@ -101,7 +101,7 @@ class SimulateOptions:
         default=1,
     )
     days: int = opt(
-        "number of days with these runs each, in one recording (default: 1)",
+        "number of days, each with these runs, in one recording (default: 1)",
         whole("a number of days", 1, 1000),
         group=_RUNS,
         default=1,
@@ -216,15 +216,15 @@ class SimulateOptions:
     )
     lane_offset: float | None = opt(
         "distance of the lane's centre line from the bridge's axis in m, positive to the left "
-        "looking from start to end; with --torsion the deck twists under it (default: the "
-        "site's, or 0)",
+        "looking from start to end; with --torsion the load of this lane twists the deck "
+        "(default: the site's, or 0)",
         number("a distance in m", low=-20, high=20),
         group=_BEYOND,
         metavar="M",
     )
     torsion: tuple[float, float] | None = opt(
         "ratio of the deck's first torsional to its first bending frequency, and its radius of "
-        "gyration in m, with a lane offset (2:2.3 is typical; default: the site's, or no twist)",
+        "gyration in m; needs a lane offset (2:2.3 is typical; default: the site's, or no twist)",
         numbers("a frequency ratio and a radius of gyration in m (RATIO:M)", (0.2, 100), (0.1, 30)),
         group=_BEYOND,
         metavar="RATIO:M",

@@ -47,7 +47,7 @@ class IntervalOptions:
     crossings: int
     """Number of crossings whose truth is drawn from the priors."""
     control: int
-    """Number of them repeated with half the noise declared."""
+    """Number of crossings repeated with only half of their noise declared."""
     scenarios: tuple[int, ...]
     out_of_model: int
     """Number of crossings for each effect."""

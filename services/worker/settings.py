@@ -46,7 +46,7 @@ class WorkerSettings(OnTheBus):
         metavar="N",
     )
     limit_s: float = opt(
-        "CPU time limit per crossing in s; on excess the crossing is retried once (default: 900)",
+        "CPU time limit per crossing in s; beyond it the crossing is retried once (default: 900)",
         number("seconds", low=1, high=1e6),
         flags=("--cpu-limit",),
         default=LIMIT_S,
@@ -54,7 +54,7 @@ class WorkerSettings(OnTheBus):
     )
     service_id: str = id_option("worker")
     validate_first: bool = flag(
-        "identify only truck and bridge pairs that have passed a site validation by "
+        "identify only crossings whose truck and bridge have passed a site validation by "
         "simulation (always so in realm live)",
         alternatives=_VALIDATION,
     )

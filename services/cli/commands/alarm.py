@@ -49,7 +49,9 @@ class AlarmOptions(OnTheBus):
     by: str | None = opt("with ack: name of the person who acknowledges", metavar="NAME")
     note: str = opt("with ack: finding or action, as a note", default="", metavar="TEXT")
     period: "Unit" = opt(
-        "period of fusion (default: week)", default="week", choices=("day", "week", "month")
+        "length of the periods whose crossings are fused (default: week)",
+        default="week",
+        choices=("day", "week", "month"),
     )
     false_alarms: float = opt(
         "tolerated false alarms per bridge and year (default: 0.01)",

@@ -36,8 +36,8 @@ class HealthOptions(OnTheBus):
     )
     metrics: bool = flag("print all figures in the format of Prometheus")
     serve: tuple[str, int] | None = opt(
-        "with --metrics: HTTP address that answers /metrics until a signal (default host: "
-        "127.0.0.1)",
+        "with --metrics: HTTP address that answers /metrics until the command is stopped (default "
+        "host: 127.0.0.1)",
         _address,
         metavar="[HOST:]PORT",
     )

@@ -45,10 +45,12 @@ class HistoryOptions:
     history: Path = history_option()
     realm: str | None = opt("realm of the bridge, if it is in several (default: the only one)")
     period: "Unit" = opt(
-        "period of fusion (default: month)", default="month", choices=("day", "week", "month")
+        "length of the periods whose crossings are fused (default: month)",
+        default="month",
+        choices=("day", "week", "month"),
     )
     site: Path | None = site_option(
-        "site file with the baseline that figures relate EI to (default: the first period)"
+        "site file with the baseline to which figures relate EI (default: the first period)"
     )
     temperature: Path | None = file_option(
         "with add: CSV file of temperatures (time_s,temperature_deg_c[,bridge])", "T.csv"

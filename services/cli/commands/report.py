@@ -53,7 +53,9 @@ class ReportOptions:
         "add a page with each bridge over time, from this history", "DIR"
     )
     period: "Unit" = opt(
-        "period of fusion (default: month)", default="month", choices=("day", "week", "month")
+        "length of the periods whose crossings are fused (default: month)",
+        default="month",
+        choices=("day", "week", "month"),
     )
 
 

@@ -43,8 +43,8 @@ class SurveyPlanOptions:
         metavar="N",
     )
     speed: tuple[float, float] | None = opt(
-        "speed in m/s, or feasible range SLOWEST:FASTEST; with a range the plan uses the "
-        "site's survey_speed_m_per_s or 10 m/s (default: 5:20)",
+        "speed in m/s, or range SLOWEST:FASTEST of feasible speeds to compare; the plan itself "
+        "then uses the site's survey_speed_m_per_s or 10 m/s (default: 5:20)",
         _speeds,
         metavar="M_PER_S",
     )

@@ -87,7 +87,7 @@ class ValidateOptions:
     noise: float = noise_option("accelerometers' noise density in µg/√Hz (default: 0)")
     site: Path | None = site_option(
         "site file (default: truck and bridge of the paper); without --method: site validation "
-        "for every pair of them (exit code 1 if one fails)"
+        "for every pair of truck and bridge in it (exit code 1 if one fails)"
     )
     json: Path | None = output_option(
         "JSON file of the table", "OUT.json", VALIDATION_JSON, AIMS_JSON
@@ -125,7 +125,7 @@ class ValidateOptions:
         default=200,
     )
     control: int = opt(
-        "number of crossings repeated with half the noise declared (default: 20)",
+        "number of crossings repeated with only half of their noise declared (default: 20)",
         whole("a number of crossings", 0),
         default=20,
     )
