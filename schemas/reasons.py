@@ -161,11 +161,11 @@ BRIDGE_REASON_TEXTS: Final[dict[BridgeReason, str]] = {
     ),
     BridgeReason.CROSSINGS_DISAGREE: (
         "Over all elements or truck values together, crossings scatter by more than their "
-        "uncertainty explains, even if single intervals overlap; they are too few to find the "
-        "wrong one."
+        "uncertainty explains, even if single intervals overlap; they are too few to show which "
+        "is wrong."
     ),
     BridgeReason.NEWEST_DISAGREE: (
-        "The newest crossings disagree with the earlier ones, from which the values are: the "
+        "The newest crossings disagree with the earlier ones, on which the values are based: the "
         "bridge may have changed."
     ),
     BridgeReason.MANY_LEFT_OUT: "Two or more good crossings disagree with the others.",
