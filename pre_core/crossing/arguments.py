@@ -42,7 +42,7 @@ class GriddedCrossing(NamedTuple):
     """Sample of `EvaluationPoints.swing`, more than a step's reach before the entry."""
     torsion: TorsionBasis = NO_TORSION
     lead: Lead = NO_LEAD
-    """Front axle of a truck whose tandem is compared: "front" and "rear" are then the tandem's."""
+    """Front axle of a truck with a tandem; "front" and "rear" are then the axles of the tandem."""
     lead_acceleration: FloatArray = _NOTHING  # (n,) of that axle, zero without one: see tandem.py
 
 

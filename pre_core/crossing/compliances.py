@@ -65,7 +65,7 @@ class CompliancePosterior(NamedTuple):
     linear: FloatArray  # (k,)
     log_odds: FloatArray  # (k,) of being exactly zero, against the density per unit
     others_root: FloatArray
-    """Lower triangle M (others, others): M' M is the covariance of the others given the sampled."""
+    """Lower triangle M (others, others): M' M is the covariance of the others given `sampled`."""
     others_linear: FloatArray
     others_sampled: FloatArray  # (others, k) block of the precision
     bias_direction: FloatArray

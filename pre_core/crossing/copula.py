@@ -1,4 +1,4 @@
-"""New draws of a distribution that is known by weighted, repeated or correlated ones."""
+"""New draws of a distribution that is known only through weighted, repeated or correlated draws."""
 
 import numpy as np
 from scipy.special import ndtr, ndtri

@@ -61,12 +61,12 @@ def mismatch_weights(
     force: FloatArray,
     stretch: ComparedStretch,
 ) -> MismatchWeights:
-    """Return the weights for the residuals of a truck, its `channels` those of one point (1, 4).
+    """Return the weights for the residuals of a truck with the `channels` of one point (1, 4).
 
-    With M_k M_0^-1 another truck mixes the input profiles, which differ by d; the front axle's
-    residuals are taken when its wheel was at the rear's present place. `density` (4,) is that of
-    the sensors, `force` (2, shapes) the suspension noise in N²/Hz. Of the deck only the torsional
-    flexibility may differ.
+    Another truck with the equations M_k mixes the input profiles, which differ by d, by M_k M_0^-1;
+    the front axle's residuals are taken when its wheel was at the rear's present place. `density`
+    (4,) is that of the sensors, `force` (2, shapes) the suspension noise in N²/Hz. Of the deck only
+    the torsional flexibility may differ.
     """
     at = folded(rows, _FREQUENCIES)
     road, deck = stretch.mismatch, stretch.torsion
@@ -93,7 +93,7 @@ def mismatch_weights(
 def correlation(
     of: MismatchWeights, truck: NoisePath, gain: FloatArray, delay_s: FloatArray
 ) -> float:
-    """Return E[r' C_0^-1 r_k] per residual sample by the mismatch alone.
+    """Return E[r' C_0^-1 r_k] per residual sample, for mismatch alone.
 
     Here r are the residuals of the first truck and r_k those of `truck`; `gain` (4,) and `delay_s`
     (4,) are those of its channels.
@@ -126,7 +126,7 @@ def mismatch_power(
     force: FloatArray,
     stretch: ComparedStretch,
 ) -> FloatArray:
-    """Return E[r' C_0^-1 (r_k - r)] per residual sample by the mismatch alone: (trucks - 1,).
+    """Return E[r' C_0^-1 (r_k - r)] per residual sample, for mismatch alone: (trucks - 1,).
 
     Here r are the residuals of the first truck and r_k those of another, each with its `channels`;
     the other arguments are as in `mismatch_weights`.

@@ -1,11 +1,11 @@
 """Expected squares of a crossing's whitened noise for trucks away from the optimum.
 
 Noise that is whitened for one truck has other expected squares for another (`posterior.all_rows`,
-`errors_in_variables`), and so biases towards trucks that transmit less. A search subtracts the
-tangent of these squares at its own truck. Draws go further: the loads on both axles and the
-stiffness of their springs may together be a third off, where the squares are far from their
-tangent. The extrapolated tangent made bridges whose fit is worse by 100 times the noise e^90 times
-likelier.
+`errors_in_variables`), and so biases the search towards trucks that transmit less. A search
+subtracts the tangent of these squares at its own truck. Draws go further: the loads on both axles
+and the stiffness of their springs may together be a third off, where the squares are far from their
+tangent. The extrapolated tangent made some bridges e^90 times likelier, although their fit was
+worse by 100 times the noise.
 """
 
 from typing import NamedTuple
@@ -53,10 +53,10 @@ class ExpectedSquares(NamedTuple):
     """Weight (f, 3, 3) of the spectra of sensor and suspension noise."""
     omega: FloatArray  # (g,)
     mismatch_weight: NDArray[np.complex128]
-    """Weight (4, 4, g) of a truck's equations at these, by the mismatch."""
+    """Weight (4, 4, g) of a truck's equations at `omega` in the squares of the mismatch."""
     y: FloatArray  # (f,) the optimum
     value: float
-    """The squares there, up to a constant."""
+    """Half the expected squares at the optimum, up to a constant."""
     tangent: FloatArray  # (f,)
 
     def beyond_tangent(self, y: FloatArray) -> FloatArray:

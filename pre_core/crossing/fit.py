@@ -215,7 +215,7 @@ def fit_all(
     """Fit all parameters from y (size,); return the optimum, if there is one, and evaluations.
 
     Negative stiffness and damping coordinates are fixed at zero, and the others brought to the
-    neighbouring optimum. The remaining gradient belongs to the `normal_approximation`.
+    neighbouring optimum. `normal_approximation` accounts for the remaining gradient.
 
     The suspension residuals and their weight depend on each other: with low weight the truck need
     not fit. So the first fit has full weight, reduced only where the body equations then leave more

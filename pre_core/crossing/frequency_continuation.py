@@ -3,11 +3,11 @@
 A bridge that vibrates at a wrong frequency is a local minimum: its oscillation slips by a period
 against the measured one, and each small change fits worse. Equal tyres on both axles leave so
 little noise that a quarter of the searches ended there, up to 350 in the log posterior below the
-true bridge, and fitted. Below the first frequency the deflection is nearly static: linear in the
-compliances of elements and bearings. So bridges are fitted to the residuals below a frequency that
-is doubled stage by stage, each of which brings the next oscillation within half a period (frequency
-continuation, as in seismic inversion: Bunks, Saleck, Zaleski and Chavent 1995). Truck and
-trajectory follow to first order, but for the offset.
+true bridge, and yet were accepted. Below the first frequency the deflection is nearly static:
+linear in the compliances of elements and bearings. So bridges are fitted to the residuals below a
+frequency that is doubled stage by stage, each of which brings the next oscillation within half a
+period (frequency continuation, as in seismic inversion: Bunks, Saleck, Zaleski and Chavent 1995).
+Truck and trajectory follow to first order, except for the offset.
 """
 
 from collections.abc import Iterator
@@ -92,8 +92,9 @@ def other_bridges(
     """Return bridges that fit better than an optimum with mismatch, best first; and evaluations.
 
     They are fitted from elements of nominal rigidity on bearings that are free or restrained, rigid
-    or compliant: both ends alike if `is_even`, else each at one end. The noise is that of a deck as
-    rough as the road: a wrong bridge passes for a rough deck, whose noise would hide a better one.
+    or compliant: both ends alike if `is_even`, else one end at a time. The noise is that of a deck
+    as rough as the road: a wrong bridge passes for a rough deck, whose noise would hide a better
+    one.
     """
     y = found.state.y
     problem = update_noise(

@@ -57,7 +57,7 @@ class FrontAxleResponse(NamedTuple):
     """Covariance (K, K) in m²/s^4 of the acceleration's error at the knots, where the surface under
     the axle is as rough as off the bridge."""
     of_values: FloatArray
-    """The same (K, K), caused by the displaced values of the axle, for its nominal mass."""
+    """Covariance (K, K) in m²/s^4 that displaced values of the axle cause, for its nominal mass."""
 
 
 def front_axle_response(problem: PosteriorProblem, y: FloatArray) -> FrontAxleResponse | None:

@@ -10,10 +10,10 @@ over different strips, and an axle with a lateral offset. Both have a known limi
 which affect the bridge but cannot be measured in one run. The levels A_j follow from the residuals
 before and after the bridge. At the speed v, d is noise in time with the spectrum S_d(f/v)/v.
 
-The axles of a tandem differ so little that their roll matters: a sensor e beside the middle of its
-axle reads e times the roll angle as well. The left and the right profile excite it, and tyres
-hardly damp it, so that the spectrum of an offset rises around the roll resonance. Bands there have
-levels of their own (`with_axle_roll`); otherwise the offset would be overestimated.
+The axles of a tandem differ so little that their roll matters: a sensor at the distance e from the
+middle of its axle reads e times the roll angle as well. The left and the right profile excite it,
+and tyres hardly damp it, so that the spectrum of an offset rises around the roll resonance. Bands
+there have levels of their own (`with_axle_roll`); otherwise the offset would be overestimated.
 
 The Bohman window truncates the covariance of d and keeps it positive, so that the residuals'
 covariance is banded. Its half length of 5 m changes the spectrum of unequal tyres by at most 2 %,
@@ -342,7 +342,7 @@ def tapered_periodogram(
 ) -> PeriodogramSegment:
     """Return the tapered periodogram of values (m,), and its exact expectation for covariances.
 
-    `sensors` (lags,) is the autocovariance of the values by sensor noise, `shapes` (s, lags) that
+    `sensors` (lags,) is the autocovariance of the values from sensor noise, `shapes` (s, lags) that
     of each shape (the debiased periodogram of Sykulski et al. 2019).
     """
     m = values.size

@@ -8,12 +8,12 @@ acceleration noise of densities n_s, n_u enters them as
     s^2 b_i   : [(m_ii s^2 + c_s s)/k_s + 1] n_s - [c_s s/k_s + 1] n_u + [m_12 s^2/k_s] n_s'
 
 (front minus rear in the mismatch; n_s' is the noise of the other body sensor). The front axle's
-residuals are taken when its wheel was at the rear wheel's present place, so that a sensor in both
-counts as two.
+residuals are taken when its wheel was at the rear wheel's present place, so that a sensor
+that enters both counts as two independent ones.
 
 Friction and nonlinear dampers put a random force, the suspension noise, into the body equations, of
 a level that the residuals determine (`suspension_noise_levels`). The mismatch is then computed from
-inertia alone, s^2 R_i: [1 + m_u s^2/K] n_u + [m_ii s^2/K] n_s + [m_12 s^2/K] n_s'. Both forms
+inertia alone, s^2 R_i: [1 + m_u s^2/K] n_u + [m_ii s^2/K] n_s + [m_12 s^2/K] n_s'. The two forms
 differ by (k_s/K) b_i and contain the same information; but which combination has little noise
 depends on the truck, and each form isolates it where it is needed. Friction is
 correlated over a tenth of a second; the Bohman window, which keeps its covariance positive,
@@ -83,7 +83,7 @@ class NoisePath(NamedTuple):
     gap_m: float = 0.0
     """Distance between the axles of the tandem."""
     lag_s: float = 0.0
-    """Time of the truck over that distance."""
+    """Time in which the truck covers `gap_m`."""
 
 
 def noise_path(
@@ -96,7 +96,7 @@ def noise_path(
 ) -> NoisePath:
     """Return the noise path of theta (p,); `wheelbase_m` is between the compared axles.
 
-    The speed matters to a tandem whose axles have springs of their own.
+    The speed matters only for a tandem whose axles have springs of their own.
     """
     if lead.ahead_m > 0.0:
         lag_s = wheelbase_m / speed_m_per_s if speed_m_per_s > 0.0 else 0.0
@@ -290,7 +290,7 @@ def mismatch_levels(
 ) -> tuple[FloatArray, float, FloatArray]:
     """Return levels (s,) in m³ of segments of mismatch residuals, and a statistic.
 
-    The statistic is that of their likelihood over zero (`whittle`); the third value holds the
+    The statistic compares them with zero levels (`whittle`); the third value holds the
     levels (s,) of the declared axles on a surface as rough as the road. With `has_only_offset` the
     level of unequal tyres is zero.
 

@@ -9,7 +9,8 @@ other.
 
 The vibration before the crossing is a wave of the bridge's own frequency, which moves with the
 bridge: removed at the frequency of the optimum it would leave, or take, a wave in the residuals of
-any other bridge. So it is noise here, in the mixture of its waves on the bridges of many points.
+any other bridge. So it is treated as noise here: a mixture of its waves on the bridges at many
+points.
 
 A truck that follows a bridge far from the optimum also changes the expected squares of the noise
 (`expected_squares`). The priors contain their tangent; the deviation from it is one more residual.
@@ -72,10 +73,10 @@ class Nuisances(NamedTuple):
     basis: FloatArray
     """Orthonormal columns (m + r + 1, s + r) that span all effects of nuisances and mixture."""
     step: FloatArray
-    """Gauss-Newton step (s, m + r + 1) of the nuisances by the residuals, all else free, too."""
+    """Factors (s, m + r + 1) from residuals to the nuisances' Gauss-Newton step, all else free."""
     expected: ExpectedSquares
     evaluations: int
-    """Number of evaluations that they took."""
+    """Number of evaluations that the nuisances took."""
 
     @property
     def mixture_size(self) -> int:
@@ -98,7 +99,7 @@ def nuisances_of(
 ) -> Nuisances:
     """Return the nuisances of a crossing about its optimum.
 
-    `problem` may have another noise than the optimum's, `jacobian` (rows, f) is that of its
+    The noise of `problem` may differ from the optimum's; `jacobian` (rows, f) is that of its
     residuals there, in the coordinates y. `drawn` (k, n + 1) are points of the curved coordinates
     and the offset, for the mixture.
     """
@@ -144,7 +145,7 @@ def with_mixture(columns: FloatArray, size: int) -> FloatArray:
 
 
 def unexplained(of: Nuisances, columns: FloatArray) -> FloatArray:
-    """Return what no nuisance explains of columns (m + r + 1, n)."""
+    """Return the part of columns (m + r + 1, n) that no nuisance explains."""
     return np.asarray(columns - of.basis @ (of.basis.T @ columns))
 
 

@@ -89,7 +89,7 @@ _WITHOUT_MISMATCH = (
 WITH_MISMATCH = (SearchStrategy(SWING_MODES, True, 1, True), SearchStrategy(0, False, 4, True))
 """Strategies in the order of trial, the simplest first, until one ends at a fit: each superfluous
 freedom may mislead the search. Of 40 drawn crossings and 36 with unexpected bearings, spans or
-tyres the first found all but one, which the second did."""
+tyres the first found all but one, which the second found."""
 
 
 class _Budget(NamedTuple):

@@ -56,7 +56,8 @@ def estimate_pavement(
 ) -> BridgePavement:
     """Return the mismatch on the bridge relative to levels (s,) off it, at y (size,).
 
-    The noise by the front axle of a tandem has waves as short, and is as rough as the deck.
+    The noise from the axle ahead of a tandem has waves as short, and scales with the deck's
+    roughness.
     """
     inside = _distance_inside_m(problem, y)
     share = _share_on_bridge(inside)
@@ -117,7 +118,7 @@ def fit_ratio(
     """Return (r, t) and their covariance (2, 2) from a tapered periodogram (f,).
 
     `known` (f,) is its expectation without mismatch, `shape` (f,) that of the mismatch of the road.
-    A taper correlates neighbours, so that every other frequency counts. Fisher scoring.
+    A taper correlates neighbours, so that only every other frequency counts. Fisher scoring.
     """
     columns = np.stack([np.ones_like(cycles_per_m), _mismatch.tilt_of(cycles_per_m)], axis=1)
     prior = np.diag([RATIO_SPREAD**-2, TILT_SPREAD**-2])
@@ -147,7 +148,7 @@ class RoadPart(NamedTuple):
 
 
 def parts_of(road: Mismatch, count: int) -> list[RoadPart]:
-    """Return the parts off and on the bridge of `count` residuals; one if all roads are alike."""
+    """Return the parts off and on the bridge of `count` residuals; one if both are alike."""
     pavement = road.pavement
     if pavement is None:
         return [RoadPart(road, float(count), False)]

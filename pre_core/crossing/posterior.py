@@ -287,8 +287,8 @@ def all_rows(problem: PosteriorProblem, y: FloatArray, temperature: float = 1.0)
 
     The data's noise is itself a function of the truck: a softer damper transmits less of it.
     Whitened for one truck, |W e|^2 has the expectation tr(C_0^-1 C(y)) for noise alone and so
-    biases towards trucks that transmit less. The gradient of that trace is subtracted: by shifting
-    the centre of the existing quadratic priors (`noise_slope`, half the gradient).
+    biases the search towards trucks that transmit less. The gradient of that trace is subtracted:
+    by shifting the centre of the existing quadratic priors (`noise_slope`, half the gradient).
     """
     where = layout(problem)
     data = problem.noise.reciprocal.size

@@ -300,7 +300,7 @@ def replace_mismatch(
 ) -> PosteriorProblem:
     """Return the problem with another mismatch, or none, in its noise at y (size,).
 
-    The noise by the axle ahead of a tandem has `runs` times its power.
+    The noise from the axle ahead of a tandem has `runs` times its power.
     """
     truck, density = noise_path_at(problem, y)
     noise = whitener(
@@ -322,7 +322,7 @@ def _with_local_noise(
     front_axle: FrontAxleResponse | None,
     runs: float = 1.0,
 ) -> Whitener:
-    """Return the whitener without lines and joints, and with the noise by a tandem's front axle."""
+    """Return the whitener without lines and joints, and with noise from a tandem's front axle."""
     noise = _without_lines(problem, noise)
     if problem.mismatch.level_m3.any():
         noise = without_joints(problem, y, noise)
@@ -358,7 +358,7 @@ def lines_hz(problem: PosteriorProblem) -> list[float]:
 def with_lines_of(
     problem: PosteriorProblem, y: FloatArray, sensors_hz: Sequence[float]
 ) -> PosteriorProblem:
-    """Return the problem at y (size,), lines at the sensor frequencies removed."""
+    """Return the problem at y (size,) with lines at the sensor frequencies removed."""
     apart_s = problem.rows.every * problem.rows.step_s
     for hz in sensors_hz:
         problem = with_line(problem, y, lines.folded_hz(hz, apart_s))

@@ -1,9 +1,10 @@
 """Posterior draws by the residuals themselves, proposed by surfaces of them.
 
-With alike tyres the posterior is so narrow that a surface fitted once is off by more than its
+With tyres of one kind the posterior is so narrow that a surface fitted once is off by more than its
 width. So draws on a surface (`search.tempering`) are weighted by the residuals there, to which the
-surface is then fitted too, until the weights hardly vary. All draws are weighted as of the mixture
-of the surfaces (adaptive multiple importance sampling: Cornuet, Marin, Mira and Robert 2012).
+surface is then fitted too, until the weights hardly vary. All draws are weighted as draws of the
+mixture of the surfaces (adaptive multiple importance sampling: Cornuet, Marin, Mira and Robert
+2012).
 """
 
 from collections.abc import Callable
@@ -87,9 +88,9 @@ def residual_draws(
     rng: np.random.Generator,
     report: Report,
 ) -> WeightedDraws:
-    """Return weighted draws (k, d), in rounds of as many as the `first` points (n, d).
+    """Return weighted draws (k, d), in rounds of n, the number of `first` points (n, d).
 
-    Rounds end as soon as all draws stand for `draws` (`is_enough`), or after `_MAX_ROUNDS`.
+    Rounds end as soon as all draws are worth `draws` (`is_enough`), or after `_MAX_ROUNDS`.
     """
     residuals = _residuals(density, first)
     level = float(_log_density(density, first, np.sum(residuals**2, axis=0)).max())
@@ -158,7 +159,7 @@ def _draws_on(
 
 
 def _weighted(density: DrawnDensity, used: list[_Fitted], batches: list[_Points]) -> WeightedDraws:
-    """Return all draws on the surfaces `used`, weighted as of their mixture."""
+    """Return all draws on the surfaces `used`, weighted as draws of their mixture."""
     y = np.concatenate([one.y for one in batches])
     squares = np.concatenate([one.squares for one in batches])
     half = -0.5 / density.inflation**2

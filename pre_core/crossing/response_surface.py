@@ -1,9 +1,9 @@
 """Response surface of a crossing's residuals: second order in its poorly determined coordinates.
 
 The whitened residuals are fitted by parabolas over points drawn from a widened posterior (Box and
-Wilson 1951). The elements enter as ln c, in which the parabolas hold further than in c. Differences
-at the optimum alone miss what a bridge with restrained ends does to a crossing whose own optimum
-has none. All other coordinates are integrated out (`nuisances`).
+Wilson 1951). The elements enter as ln c, in which the parabolas hold over a wider range than in c.
+Differences at the optimum alone miss what a bridge with restrained ends does to a crossing whose
+own optimum has none. All other coordinates are integrated out (`nuisances`).
 """
 
 from collections.abc import Callable

@@ -74,7 +74,7 @@ def filter_rows(taps: FloatArray, every: int, x: FloatArray, out: FloatArray) ->
 
 
 def filter_adjoint(rows: RowFilter, y: FloatArray, samples: int) -> FloatArray:
-    """Return the adjoint of `filter_rows`: of values y (m,) to as many `samples` (n,)."""
+    """Return the adjoint of `filter_rows`, from values y (m,) to `samples` values (n,)."""
     apart = np.zeros(rows.every * (y.size - 1) + 1)
     apart[:: rows.every] = y
     out = np.zeros(samples)

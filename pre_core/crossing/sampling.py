@@ -34,7 +34,7 @@ from pre_core.search.loop import Report, Termination
 _LARGEST_R_HAT = 1.05
 """Convergence limit of R-hat of rigidities and mass."""
 _MAX_RUNS = 14
-"""Limit of draws with alike tyres, relative to the requested ones."""
+"""Limit of draws with tyres of one kind, relative to the requested ones."""
 _LEAST_ESS = 30.0
 """Effective number of draws below which their quantiles say nothing."""
 _NEGLIGIBLE_ODDS = 0.02
@@ -153,10 +153,10 @@ def _resample_to_chains(
 def _mismatch_draws(
     found: Optimum, draws: int, seed: int, inflation: float, report: Report
 ) -> PosteriorDraws:
-    """Return draws with mismatch: by the residuals where tyres are alike, else by their surface.
+    """Return draws with mismatch: by the residuals for tyres of one kind, else by their surface.
 
-    With alike tyres the posterior is so narrow that no surface is exact enough. Where weighted
-    draws do not suffice they are replaced by those of `compliances`, linear in c.
+    With tyres of one kind the posterior is so narrow that no surface is exact enough. Where
+    weighted draws do not suffice they are replaced by those of `compliances`, linear in c.
     """
     if has_alike_tyres(found.problem.mismatch):
         return _alike_tyres_draws(found, draws, seed, inflation, report)

@@ -2,10 +2,10 @@
 
 Elements, supports and offset are determined so poorly that their posterior is neither normal nor
 near the optimum. Truck and trajectory follow them (`nuisances`) and are integrated out, so that
-the few are drawn with weights: by the residuals themselves where the axles' tyres are alike, and
-else from a surface of them (`response_surface`). That surface is fitted twice: at points of the
-normal about the optimum, linear in c (`compliances`), and at points of the posterior on that first
-surface, both widened.
+these few are drawn with weights: by the residuals where both axles have tyres of one kind, and
+otherwise from a surface of them (`response_surface`). That surface is fitted twice: at points of
+the normal about the optimum, linear in c (`compliances`), and at points of the posterior on that
+first surface, both widened.
 """
 
 from collections.abc import Callable
@@ -124,7 +124,7 @@ def curved_coordinates(found: Optimum) -> NDArray[np.int64]:
 def surface_points(found: Optimum, inflation: float, seed: int) -> FloatArray:
     """Return points (POINTS, n + 1) of a crossing's curved coordinates and offset, for a surface.
 
-    With alike tyres the normal about the optimum is close to the posterior.
+    With tyres of one kind the normal about the optimum is close to the posterior.
     """
     if has_alike_tyres(found.problem.mismatch):
         return _points_of_normal(found, POINTS, inflation, seed)
@@ -204,7 +204,7 @@ def complete(
     inflation: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Return y (k, f) with the others drawn given the curved coordinates and offset (k, n + 1)."""
+    """Return y (k, f) with all else drawn given the curved coordinates and offset (k, n + 1)."""
     y, jacobian = found.state.y, found.state.jacobian
     kept = np.append(curved_coordinates(found), place_of_offset(found.problem))
     others = np.setdiff1d(np.arange(y.size), kept)

@@ -86,7 +86,7 @@ def coordinates(found: Optimum, inflation: float) -> SurrogateCoordinates:
 
 
 def restricted(coords: SurrogateCoordinates, kept: NDArray[np.int64]) -> SurrogateCoordinates:
-    """Return the coordinates of a density of the coordinates `kept` (n,) alone, none of it normal.
+    """Return the coordinates of a density of `kept` (n,) alone, all of them non-normal.
 
     All curved and half-normal coordinates that matter are among them.
     """

@@ -1,4 +1,4 @@
-"""Spectra of suspension noise, by friction and nonlinear dampers, from basis functions."""
+"""Spectra of suspension noise, from friction and nonlinear dampers, by basis functions."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ FORCE_SHAPES = _FORCE_CENTRES_HZ.size
 """Number of basis functions, a few hertz wide, in the spectrum of the suspension noise: that of dry
 friction falls by six decades from the body's bounce to the residuals' highest frequency."""
 FORCE_MEMORY_S = 0.3
-"""Lag in s beyond which the suspension noise has no covariance; it sets the bumps' width."""
+"""Lag in s beyond which the suspension noise has no covariance; it sets the width of its shapes."""
 
 
 def force_rms_n(force: FloatArray) -> FloatArray:

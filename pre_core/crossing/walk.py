@@ -53,7 +53,7 @@ class Placement(NamedTuple):
     shift_m: float
     bridge: FloatArray
     places: NDArray[np.int64]
-    """Indices in y of these parameters."""
+    """Indices in y of the bridge's parameters."""
 
 
 LocalFit = Callable[[float, FloatArray], tuple[Placement, int]]
@@ -63,7 +63,7 @@ LocalFit = Callable[[float, FloatArray], tuple[Placement, int]]
 def others_effects(
     problem: PosteriorProblem, y: FloatArray, held: NDArray[np.int64], temperature: float
 ) -> FloatArray:
-    """Return an orthonormal basis (rows, f - h) of what all coordinates but `held` (h,) affect.
+    """Return an orthonormal basis (rows, f - h) of the effects of all coordinates but `held` (h,).
 
     It is that of the residuals' derivatives at y (f,), which take f + 1 evaluations.
     """

@@ -42,7 +42,7 @@ def importance_draws(
     """Return weighted draws in batches, until they suffice (`is_enough`) or `_MAX_BATCHES` exist.
 
     Each batch is of a surrogate, `now` at first, that is refined by the draws so far; its chains
-    start about `start` (f,). All draws are weighted as of the mixture of the surrogates.
+    start about `start` (f,). All draws are weighted as draws of the mixture of the surrogates.
     """
     centre = surrogate.transform(coordinates, start)
     count = batch_size(draws)
@@ -84,5 +84,5 @@ def _in_parts(target: LogDensity, y: FloatArray) -> FloatArray:
 
 
 def is_enough(worth: importance.SmoothedWeights, draws: int) -> bool:
-    """Return whether weighted draws stand for the requested ones, with a light tail."""
+    """Return whether weighted draws are worth the requested number, with a light tail."""
     return worth.pareto_k <= _LARGEST_PARETO_K and worth.ess >= MIN_EFFECTIVE_SHARE * draws

@@ -19,8 +19,8 @@ def maximum_likelihood_levels(
 
     `known` (f,) is the spectrum without them. The statistic is the likelihood ratio 2 ln(L/L_0) of
     independent frequencies: the sum over all of them, halved because a taper correlates neighbours.
-    Every level is multiplied by the root of its explained over its claimed power (`prior_power`
-    more, by a prior) until none changes by more than `tolerance`.
+    Every level is multiplied by the root of its observed over its expected power, the latter plus
+    `prior_power` from a prior, until none changes by more than `tolerance`.
     """
     level = start
     for _ in range(_PASSES):

@@ -48,7 +48,7 @@ class Density(NamedTuple):
 
 
 def density(still: NoiseSegment) -> Density | None:
-    """Return the noise density of one channel; None if there is too little, or only motion."""
+    """Return the noise density of one channel; None for too few samples, or only motion."""
     low = _STANDING_BAND_HZ if still.is_standing else _DRIVING_BAND * still.rate_hz
     high = _TOP_OF_BAND * still.rate_hz
     if high <= low or (not still.is_standing and low < _WHEELS_HZ):

@@ -45,7 +45,7 @@ class ConsistencyResult(NamedTuple):
     agree: tuple[str, ...]
     left_out: tuple[str, ...]
     disagree: bool
-    """Whether the kept ones contradict each other and are too few to find the wrong one."""
+    """Whether the kept crossings contradict each other and are too few to show which is wrong."""
 
 
 def select_consistent(

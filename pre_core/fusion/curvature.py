@@ -184,8 +184,8 @@ def curved_form(
 ) -> CurvedForm:
     """Return the residuals target - root x of a likelihood with all other coordinates zero.
 
-    `of_bridge` (m, b) and `of_terms` (m, 1 + k) are columns of its root; `free` (m, m) takes from
-    residuals what all others explain, which determines the offset.
+    `of_bridge` (m, b) and `of_terms` (m, 1 + k) are columns of its root; `free` (m, m)
+    removes the part of residuals that the others explain; what remains determines the offset.
     """
     rows = np.column_stack([target, -of_bridge, -of_terms])
     if bends is None:

@@ -58,7 +58,7 @@ class CurvedSum(NamedTuple):
     sigma: FloatArray  # (e,) spread of ln EI
     mean: FloatArray  # (b,) the most likely bridge y
     covariance: FloatArray
-    """Covariance (b, b) of a normal wider than the one about it, from which draws begin."""
+    """Covariance (b, b) of the normal from which draws begin, wider than the one about `mean`."""
 
     def log_posterior(self, y: FloatArray, pool: ThreadPoolExecutor) -> FloatArray:
         """Return the log posterior (k,) of bridges y (k, b), up to a constant."""

@@ -89,7 +89,7 @@ def likelihood(
     """Return the likelihood at an optimum.
 
     Without `with_bends` it has no curvature terms, no offset and no response to short waves. The
-    terms are of a surface fitted at `points` (k, n + 1) as of `PosteriorDraws`; None: drawn ones.
+    terms are of a surface fitted at `points` (k, n + 1), see `PosteriorDraws`; None: new draws.
     """
     problem, state = _in_fusion(found)
     where, mismatch = posterior.layout(problem), found.problem.mismatch
@@ -150,7 +150,7 @@ def _in_fusion(
 ) -> tuple[posterior.PosteriorProblem, levenberg_marquardt.LMState]:
     """Return problem and state at an optimum with the noise of a run among others.
 
-    Long waves of the mismatch are parameters, and the noise by a tandem's front axle is shared.
+    Long waves of the mismatch are parameters, and the noise from a tandem's front axle is shared.
     """
     problem, y = found.problem, found.state.y
     differs = bool(problem.mismatch.level_m3.any())

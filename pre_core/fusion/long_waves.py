@@ -54,7 +54,7 @@ class OffBridgeMismatch(NamedTuple):
 
 
 def knot_spacing_m(mismatch: Mismatch) -> float:
-    """Return the knot spacing for axles with their tyres, the same in all runs of a truck."""
+    """Return the knot spacing for axles with these tyres, the same in all runs of a truck."""
     return ALIKE_KNOT_M if has_alike_tyres(mismatch) else KNOT_M
 
 

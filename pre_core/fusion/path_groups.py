@@ -80,7 +80,7 @@ class PathGroup(NamedTuple):
     """Covariance (q, q) of the shared part in mm²; None for a single run, whose waves are its own.
     """
     short_roots: dict[str, FloatArray]
-    """Root (b, r) by run of its errors' covariance with those of the others by short waves."""
+    """Root (b, r) by run of the covariance of its short-wave errors with those of the others."""
 
 
 def path_groups(parts: Sequence[FusionInput]) -> dict[PathGroupKey, PathGroup]:
@@ -152,7 +152,7 @@ def wave_precision(part: FusionInput, groups: Mapping[PathGroupKey, PathGroup]) 
 
 
 def low_rank_root(covariance: FloatArray) -> FloatArray:
-    """Return a root (q, r) of a covariance (q, q) = root root', without rounding directions."""
+    """Return a root (q, r) of a covariance (q, q) = root root', without directions of rounding."""
     values, vectors = np.linalg.eigh(covariance)
     kept = values > _NOTHING * values[-1]
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))

@@ -1,4 +1,4 @@
-"""Errors by short waves of the profile mismatch that the runs of a wheel-path group share.
+"""Errors from short waves of the profile mismatch that the runs of a wheel-path group share.
 
 The likelihood of a crossing treats the mismatch in waves shorter than those of its coefficients as
 noise of its own. Runs on one path share these waves too, as far as the lateral wander leaves them
@@ -70,7 +70,7 @@ def shared_error_roots(
 ) -> list[FloatArray]:
     """Return for each run a root (b, r) of its errors' covariance with those of all other runs.
 
-    `density_m3` (n,) is the one-sided spectrum of what the runs share, at the waves of the
+    `density_m3` (n,) is the one-sided spectrum of the shared part, at the waves of the
     responses. Of the covariance of two runs each takes half.
     """
     phasors = np.stack([one.cosine + 1j * one.sine for one in responses])

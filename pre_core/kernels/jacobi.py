@@ -95,7 +95,7 @@ def diagonalise_one(a: FloatArray, v: FloatArray) -> bool:
     """Rotate one matrix `a` (m, m) to diagonal form, reading both triangles; `v` is (m, m).
 
     Unlike `diagonalise` it skips rotations without effect, which four matrices cannot agree on. It
-    also reverses the matrix meanwhile: beam modes rise by powers of ten, and a matrix graded in
+    also reverses the order of the matrix: beam modes rise by powers of ten, and a matrix graded in
     this way needs half as many sweeps from its large end.
     """
     _reverse(a)

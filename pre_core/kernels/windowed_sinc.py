@@ -22,7 +22,7 @@ def windowed_sinc(
 
     They are not normalised. `cutoff`, in cycles per sample, is the frequency of half amplitude; the
     window ends at `reach`. There the Kaiser window is one (I_0(beta) in the middle): subtracting
-    that as `pedestal` makes a sample that comes into reach change nothing.
+    that as `pedestal` avoids a jump when a sample comes into reach.
     """
     inside = np.maximum(0.0, 1.0 - (distance / reach) ** 2)
     window = np.i0(beta * np.sqrt(inside)) - pedestal

@@ -70,7 +70,7 @@ class AlarmRules(NamedTuple):
 
 
 class AcknowledgedChange(NamedTuple):
-    """An acknowledged change, by numbers of periods."""
+    """An acknowledged change, given by numbers of periods."""
 
     since: int
     """First period of the changed bridge."""
@@ -128,8 +128,8 @@ class PeriodDifference(NamedTuple):
 def judged_periods(periods: Sequence[Period], learning: int) -> NDArray[np.bool_]:
     """Return flags (periods,) of the periods that can be compared with earlier ones.
 
-    These are periods of known temperature after `learning` of known temperature, and any period a
-    year after the first, when the season is known without a thermometer.
+    These are periods of known temperature after the first `learning` such periods, and any period
+    a year after the first one, when the season is known without a thermometer.
     """
     out = np.zeros(len(periods), dtype=bool)
     warm = 0

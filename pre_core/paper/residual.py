@@ -155,7 +155,8 @@ def march_four(
     """Compute J of four vectors `theta` (4, p) to `total` (4,); roads stay in `work.road`.
 
     An evaluation stops early once the J of every vector has passed its `limit` (4,), which decides
-    a comparison J <= limit exactly; `total` then exceeds the limit. It is infinite if not finite.
+    a comparison J <= limit exactly; `total` then exceeds the limit. Where J is not finite, `total`
+    is infinite.
     """
     total[:] = np.inf
     for i in range(theta.shape[0]):

@@ -48,7 +48,7 @@ class ModalBridge(NamedTuple):
     element_lengths: FloatArray  # (elements,)
     vibration: FloatArray  # (2, k): initial displacement and velocity
     vibration_step: int
-    """Step at which the vibration begins, until when the bridge is at rest; -1: never."""
+    """Step at which the vibration begins; until then the bridge is at rest. -1: never."""
 
 
 class WheelTrack(NamedTuple):
@@ -64,7 +64,7 @@ class WheelTrack(NamedTuple):
 
 
 class MarchScheme(NamedTuple):
-    """Time step, and the end of the iterations within a step."""
+    """Time step, and the criteria that end the iterations within a step."""
 
     step_s: float
     tolerance: float

@@ -148,8 +148,8 @@ def pink_noise(
 ) -> FloatArray:
     """Return noise (count,) of the one-sided power density density^2 corner/f.
 
-    It is composed of random harmonics over twice the time and cut in half, so that its end does not
-    continue in its beginning. It has no power below the lowest harmonic.
+    It is composed of random harmonics over twice the time and cut in half, so that it is not
+    periodic. It has no power below the lowest harmonic.
     """
     if corner_hz <= 0.0 or density <= 0.0:
         return np.zeros(count)

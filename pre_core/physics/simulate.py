@@ -45,7 +45,7 @@ class WheelRoad(NamedTuple):
 
 
 class Discretisation(NamedTuple):
-    """Time step, modes of the bridge, and the end of the iterations within a step."""
+    """Time step, modes of the bridge, and the criteria that end the iterations within a step."""
 
     step_s: float
     modes: int | None = None

@@ -70,7 +70,7 @@ class SharedLoad(NamedTuple):
     """Mass that the front springs carry."""
     bogie_kg: float
     lever_m: float
-    """Distance o_b of the bogie's force behind the front axle."""
+    """Distance o_b of the tandem's force behind the front axle."""
 
 
 @kernel

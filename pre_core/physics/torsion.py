@@ -94,9 +94,9 @@ def sine_cubics(part_m: FloatArray, span_m: FloatArray, modes: int) -> FloatArra
 
 
 def mean_receptance(basis: TorsionBasis, theta: FloatArray, omega: FloatArray) -> ComplexArray:
-    """Return the mean receptance (f,) in m of a deck of g = 1/N under an axle, over its places.
+    """Return the mean receptance (f,) in m of a deck of g = 1/N under an axle, over all places.
 
-    It is the deflection by a harmonic force on the same place, at angular frequencies (f,), of the
+    It is the deflection by a harmonic force at the same place, at angular frequencies (f,), of the
     modes and the remainder below with the damping of `theta` (p,); zero for `NO_TORSION`.
     """
     squared = (1j * omega) ** 2

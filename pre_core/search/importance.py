@@ -32,7 +32,7 @@ class SmoothedWeights(NamedTuple):
 def mixture_log_weights(
     log_target: FloatArray, log_density: FloatArray, counts: NDArray[np.int64]
 ) -> FloatArray:
-    """Return the log weights (k,) of draws from several densities, as of one mixture of them.
+    """Return the log weights (k,) of draws from several densities, as draws of their mixture.
 
     `log_target` (k,) and `log_density` (k, r) are at all draws, which come in the order of the
     densities, `counts` (r,) of each. None is normalised: the densities are scaled so that each has

@@ -15,7 +15,7 @@ class LatentCoordinates(NamedTuple):
     """
 
     places: NDArray[np.int64]
-    """Indices of these among the values."""
+    """Indices of the values that must not be negative."""
     log_odds: FloatArray  # (b,) of zero, against the density per unit
 
     def values(self, v: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Draws of a density with several or bent peaks: sequential Monte Carlo.
+"""Draws of a density with several or curved peaks: sequential Monte Carlo.
 
 A population follows a path of densities from a wide normal to the target (Del Moral, Doucet and
 Jasra 2006). Each step to the next density leaves half of the draws effective (Jasra et al. 2011),

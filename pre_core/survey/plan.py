@@ -1,8 +1,8 @@
 """Information of a planned survey: likelihoods times numbers of crossings, plus priors.
 
-One crossing of the nominal truck over the nominal bridge, without noise but with all of it in the
-model, has the mean information of a real one: J'J of its whitened residuals does not depend on
-the noise realisation. Deflection is linear in the compliances c = EI_nominal/EI
+One crossing of the nominal truck over the nominal bridge, simulated without the noise that the
+model contains, has the mean information of a real one: J'J of its whitened residuals does
+not depend on the noise realisation. Deflection is linear in the compliances c = EI_nominal/EI
 (`crossing.compliances`), so that this is also the information on a damaged bridge.
 
 Crossings of a wheel-path group share a part of the profile mismatch (`fusion.joint`): it has
@@ -59,7 +59,7 @@ class BridgePrior(NamedTuple):
 
 
 class PlannedPathGroup(NamedTuple):
-    """Crossings of one wheel-path group in equal numbers."""
+    """One wheel-path group; each of its planned crossings is repeated equally often."""
 
     precisions: tuple[FloatArray, ...]
     """Precisions (b + k, b + k): the bridge's parameters, then the shared mismatch in mm at k
