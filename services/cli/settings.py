@@ -73,7 +73,9 @@ class IdentifyOptions:
         group=_MANY,
         metavar="S",
     )
-    tls: Path | None = opt("credentials of a cluster's client", Path, group=_MANY, metavar="FOLDER")
+    tls: Path | None = opt(
+        "credentials for the client of a Dask cluster", Path, group=_MANY, metavar="FOLDER"
+    )
 
     @property
     def search_method(self) -> str:

@@ -105,9 +105,9 @@ class ValidateOptions:
     )
     seed: int = seed_option()
     method: str | None = opt(
-        "paper: the paper's search and least squares, without sensors; pre: coverage of intervals, "
-        "with the options below; exit code 1 on a missed target (default: paper; with --site: site "
-        "validation)",
+        "paper: the paper's search and least squares, with no sensor error but --noise; pre: "
+        "coverage of intervals, with the options below; exit code 1 on a missed target (default: "
+        "paper; with --site: site validation)",
         choices=("paper", "pre"),
     )
     truck: str | None = opt(
