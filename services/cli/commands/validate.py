@@ -149,7 +149,7 @@ class ValidateOptions:
     )
     surveys: int = opt(
         "number of fused surveys, of 8 to 16 crossings, for each of --kinds; nothing else "
-        "is run then (default: 0)",
+        "is then run (default: 0)",
         whole("a number of surveys", 0),
         default=0,
     )
