@@ -112,6 +112,8 @@ class Optimum(NamedTuple):
     noise_power: float = 1.0
     """Noise power ratio where it clearly exceeds one, which resembles friction and mismatch. Up to
     `HOPELESS_NOISE` the fit used it."""
+    rivals: tuple[FloatArray, ...] = ()
+    """Points (f,) with other bridges that explain the residuals nearly as well."""
 
 
 def chi2_per_dof(problem: PosteriorProblem, y: FloatArray) -> float:

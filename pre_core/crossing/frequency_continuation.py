@@ -12,6 +12,7 @@ Truck and trajectory follow to first order, except for the offset.
 
 from collections.abc import Iterator
 from itertools import product
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -38,8 +39,10 @@ from pre_core.search.levenberg_marquardt import minimise
 _STAGES_HZ = (1.5, 3.0, 6.0, 12.0, 24.0)
 _STEPS, _LAST_STEPS = 10, 20
 """Limits of the steps of a stage, and of the fit to all frequencies after them."""
-_ENOUGH = 0.5
-"""Improvement of the sum of squares that ends a stage."""
+ENOUGH = 0.5
+"""Improvement of the sum of squares that ends a stage, and that another bridge must promise."""
+_RIVAL = 20.0
+"""Sum of squares above the optimum's up to which a bridge is kept: a probability of e^-10."""
 _FEWEST_WAVES = 8
 _SMALLEST_COMPLIANCE = 0.1
 """Smallest compliance of an element in a fit, relative to the nominal one."""
@@ -49,9 +52,10 @@ _SAME_BRIDGE = 0.3
 
 
 class OtherBridge(NamedTuple):
-    """A bridge fitted from another start, and the sum of squares there."""
+    """A bridge fitted from another start."""
 
-    objective: float
+    gain: float
+    """Sum of squares at the optimum minus that here."""
     y: FloatArray
     """The point (f,) with this bridge and its offset, everything else as it was."""
 
@@ -89,12 +93,12 @@ class _Coordinates(NamedTuple):
 def other_bridges(
     found: Optimum, strategy: SearchStrategy, *, is_even: bool
 ) -> tuple[list[OtherBridge], int]:
-    """Return bridges that fit better than an optimum with mismatch, best first; and evaluations.
+    """Return bridges that fit about as well as an optimum, best first; and evaluations.
 
     They are fitted from elements of nominal rigidity on bearings that are free or restrained, rigid
     or compliant: both ends alike if `is_even`, else one end at a time. The noise is that of a deck
     as rough as the road: a wrong bridge passes for a rough deck, whose noise would hide a better
-    one.
+    one. Those more than `_RIVAL` worse are left out.
     """
     y = found.state.y
     problem = update_noise(
@@ -103,23 +107,21 @@ def other_bridges(
     )  # fmt: skip
     at = _coordinates(problem)
     fit = _ContinuedFit(problem, y, strategy, at)
-    here = OtherBridge(fit.objective(np.append(y[at.places], 0.0)), y)
+    level = fit.objective(np.append(y[at.places], 0.0))
     # With this noise the optimum's own bridge may lead to a better one, too.
     starts = [
         (np.append(y[at.places], 0.0), ()),
         *((one, _STAGES_HZ) for one in _starts(at, is_even=is_even)),
     ]
-    tried = sorted((fit.run(start, stages) for start, stages in starts), key=_objective)
-    distinct = [here]
-    for one in tried:
-        moves = [np.abs(one.y - other.y)[[*at.places, -1]].max() for other in distinct]
-        if one.objective < here.objective - _ENOUGH and min(moves) > _SAME_BRIDGE:
-            distinct.append(one)
-    return distinct[1:], fit.evaluations
-
-
-def _objective(one: OtherBridge) -> float:
-    return one.objective
+    tried = [fit.run(start, stages) for start, stages in starts]
+    distinct = [y]
+    others = []
+    for objective, moved in sorted(tried, key=itemgetter(0)):
+        apart = [np.abs(moved - other)[[*at.places, -1]].max() for other in distinct]
+        if objective < level + _RIVAL and min(apart) > _SAME_BRIDGE:
+            distinct.append(moved)
+            others.append(OtherBridge(level - objective, moved))
+    return others, fit.evaluations
 
 
 def _coordinates(problem: PosteriorProblem) -> _Coordinates:
@@ -186,8 +188,8 @@ class _ContinuedFit:
         self.evaluations += 1
         return float(np.sum(self._residuals(start[None, :]) ** 2))
 
-    def run(self, start: FloatArray, stages_hz: tuple[float, ...]) -> OtherBridge:
-        """Return the bridge fitted below each of the frequencies, and at last to all."""
+    def run(self, start: FloatArray, stages_hz: tuple[float, ...]) -> tuple[float, FloatArray]:
+        """Return the sum of squares and y (f,) of the bridge fitted stage by stage, last to all."""
         u = self._at.from_y(start)
         for up_to_hz in stages_hz:
             u, _ = self._stage(u, up_to_hz, _STEPS)
@@ -195,7 +197,7 @@ class _ContinuedFit:
         y, moved = self._y.copy(), self._at.to_y(u)
         y[self._at.places] = moved[:-1]
         y[self._where.trajectory] += moved[-1]
-        return OtherBridge(objective, y)
+        return objective, y
 
     def _residuals(self, moved: FloatArray) -> FloatArray:
         """Return residuals (k, rows) at coordinates (k, n + 1) in y that no other one explains."""
@@ -213,6 +215,6 @@ class _ContinuedFit:
             low = dct(rows[:, : self._data : RESIDUALS], axis=1, norm="ortho")[:, :waves]
             return np.hstack([low, rows[:, self._data :]])
 
-        found = minimise(residuals, u, steps, _ENOUGH, self._at.lower, is_followed=True)
+        found = minimise(residuals, u, steps, ENOUGH, self._at.lower, is_followed=True)
         self.evaluations += evaluations_of(found)
         return found.state.y, found.state.objective

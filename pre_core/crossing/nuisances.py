@@ -154,6 +154,18 @@ def integrated_residuals(of: Nuisances, drawn: FloatArray, *, has_step: bool) ->
 
     Each point takes an evaluation, and another one if it `has_step` of its own.
     """
+    points = followed(of, drawn, has_step=has_step)
+    residuals = unexplained(of, _residuals(of, points))
+    squares = _LEVEL**2 - 2.0 * of.expected.beyond_tangent(points)
+    residuals[-1] = np.sqrt(np.maximum(squares, 0.0))
+    return residuals
+
+
+def followed(of: Nuisances, drawn: FloatArray, *, has_step: bool) -> FloatArray:
+    """Return points y (k, f) with the nuisances that follow points (k, n + 1).
+
+    Each takes an evaluation if it `has_step` of its own.
+    """
     where, parts = posterior.layout(of.problem), of.parts
     moves = drawn - of.y[of.kept]
     points = np.repeat(of.y[None, :], drawn.shape[0], axis=0)
@@ -163,10 +175,7 @@ def integrated_residuals(of: Nuisances, drawn: FloatArray, *, has_step: bool) ->
     points[:, parts.linear] += moves @ of.of_linear.T
     if has_step:
         points[:, of.own] += (of.step @ _residuals(of, points)).T
-    residuals = unexplained(of, _residuals(of, points))
-    squares = _LEVEL**2 - 2.0 * of.expected.beyond_tangent(points)
-    residuals[-1] = np.sqrt(np.maximum(squares, 0.0))
-    return residuals
+    return points
 
 
 def _residuals(of: Nuisances, points: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from pre_core.crossing.fit import (
     complete_fit,
     fit_all,
 )
-from pre_core.crossing.frequency_continuation import other_bridges
+from pre_core.crossing.frequency_continuation import ENOUGH, OtherBridge, other_bridges
 from pre_core.crossing.mismatch import has_alike_tyres
 from pre_core.crossing.posterior import has_tandem, layout
 from pre_core.crossing.walk import better_neighbour, shifted_to
@@ -22,6 +22,8 @@ _MAX_MOVES = 4
 """Limit of moves from an optimum to a neighbouring one."""
 _TRIED_BRIDGES = 2
 """Limit of other bridges from which all parameters are fitted, after each optimum."""
+_KEPT_RIVALS = 4
+"""Limit of other bridges near which the posterior is drawn, too."""
 
 
 def refined(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> tuple[Optimum, int]:
@@ -47,13 +49,14 @@ def _with_other_bridge(
     found: Optimum, strategy: SearchStrategy, max_evaluations: int
 ) -> tuple[Optimum, int]:
     """Return the best of an optimum and those of other bridges, and the evaluations."""
-    evaluations, failed = 0, 0
-    is_even = True
+    evaluations = 0
+    rivals: list[OtherBridge] = []
+    failed, is_even = 0, True
     while failed < 2 and evaluations <= max_evaluations and _is_sharp(found):
         others, used = other_bridges(found, strategy, is_even=is_even)
         evaluations += used
         before = found
-        for other in others[:_TRIED_BRIDGES]:
+        for other in [one for one in others if one.gain > ENOUGH][:_TRIED_BRIDGES]:
             fitted, used = fit_all(found.problem, other.y, strategy)
             evaluations += used
             if fitted is None:
@@ -63,9 +66,11 @@ def _with_other_bridge(
             if is_better(completed, found):
                 found = completed
                 break
-        failed = failed + 1 if found is before else 0
+        is_same = found is before
+        failed, rivals = (failed + 1, [*rivals, *others]) if is_same else (0, [])
         is_even = not is_even
-    return found, evaluations
+    rivals.sort(key=lambda one: -one.gain)
+    return found._replace(rivals=tuple(one.y for one in rivals[:_KEPT_RIVALS])), evaluations
 
 
 def _refine_offset(

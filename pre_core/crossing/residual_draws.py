@@ -93,7 +93,7 @@ def residual_draws(
     Rounds end as soon as all draws are worth `draws` (`is_enough`), or after `_MAX_ROUNDS`.
     """
     residuals = _residuals(density, first)
-    level = float(_log_density(density, first, np.sum(residuals**2, axis=0)).max())
+    level = float(log_density(density, first, np.sum(residuals**2, axis=0)).max())
     # A size of zero is that of what the site file excludes.
     frame = _Frame(first.mean(axis=0), np.maximum(first.std(axis=0), _LEAST_SIZE), level)
     batches, used = [_evaluated(density, frame, first, residuals)], list[_Fitted]()
@@ -114,7 +114,7 @@ def _residuals(density: DrawnDensity, y: FloatArray) -> FloatArray:
     return np.nan_to_num(np.hstack(found), nan=_IMPOSSIBLE, posinf=_IMPOSSIBLE, neginf=_IMPOSSIBLE)
 
 
-def _log_density(density: DrawnDensity, y: FloatArray, squares: FloatArray) -> FloatArray:
+def log_density(density: DrawnDensity, y: FloatArray, squares: FloatArray) -> FloatArray:
     """Return the log posterior (k,) at points y (k, d) with these squares (k,)."""
     return -0.5 / density.inflation**2 * (squares + density.prior_squares(y))
 
@@ -123,7 +123,7 @@ def _evaluated(
     density: DrawnDensity, frame: _Frame, y: FloatArray, residuals: FloatArray
 ) -> _Points:
     squares = np.sum(residuals**2, axis=0)
-    higher = (_log_density(density, y, squares) - frame.level) / y.shape[1]
+    higher = (log_density(density, y, squares) - frame.level) / y.shape[1]
     weight = np.exp(np.clip(higher, -_STEEPEST, _STEEPEST))
     sums = sums_of((y - frame.centre) / frame.size, residuals, weight)
     return _Points(y, squares, weight, sums)
@@ -152,7 +152,7 @@ def _draws_on(
 
     def target(v: FloatArray) -> FloatArray:
         y = latent.values(v)
-        return _log_density(density, y, fitted.squares(y)) + latent.log_share(v)
+        return log_density(density, y, fitted.squares(y)) + latent.log_share(v)
 
     covariance = _START_SPREAD**2 * fitted.root @ fitted.root.T
     return latent.values(tempering.tempered_draws(target, fitted.mean, covariance, count, 1, rng))

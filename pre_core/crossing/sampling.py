@@ -56,7 +56,7 @@ class PosteriorDraws(NamedTuple):
     ending: Termination
     pareto_k: float | None = None
     points: FloatArray | None = None
-    """Points (`response_surface.POINTS`, n + 1) of the widened posterior with mismatch."""
+    """Points (`response_surface.POINTS` at least, n + 1) with mismatch, for a surface in fusion."""
 
 
 def sample(
@@ -177,7 +177,7 @@ def _alike_tyres_draws(
     Draws linear in c, used only if few weighted ones are effective, had errors of six standard
     deviations in such cases.
     """
-    weighted, evaluations = drawn_by_residuals(found, draws, seed, inflation, report)
+    weighted, evaluations, points = drawn_by_residuals(found, draws, seed, inflation, report)
     if weighted.worth.ess < _LEAST_ESS:
         # Diagnostics are of the draws that failed, not of those in their place.
         chains = _compliance_draws(found, draws, seed, inflation)._replace(
@@ -188,7 +188,7 @@ def _alike_tyres_draws(
         )
     else:
         chains = _completed_to_chains(found, weighted, draws, seed, inflation)
-    return chains._replace(evaluations=evaluations)
+    return chains._replace(evaluations=evaluations, points=points)
 
 
 def _completed_to_chains(

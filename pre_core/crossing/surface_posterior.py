@@ -24,11 +24,12 @@ from pre_core.crossing.mismatch import has_alike_tyres
 from pre_core.crossing.nuisances import (
     Nuisances,
     ResidualParts,
+    followed,
     integrated_residuals,
     nuisances_of,
     place_of_offset,
 )
-from pre_core.crossing.residual_draws import DrawnDensity, residual_draws
+from pre_core.crossing.residual_draws import DrawnDensity, log_density, residual_draws
 from pre_core.crossing.response_surface import (
     POINTS,
     POINTS_OF_DRAWS,
@@ -44,6 +45,7 @@ from pre_core.crossing.weighted_draws import (
 )
 from pre_core.search import convergence, importance
 from pre_core.search.latent import LatentCoordinates
+from pre_core.search.levenberg_marquardt import initial_state
 from pre_core.search.loop import Report
 
 _WIDENED = 2.0
@@ -51,8 +53,20 @@ _WIDENED = 2.0
 seldom outside, and is where many crossings are linearised in fusion."""
 _WIDER = 1.2
 """The same for the first points of draws by the residuals."""
+_NEGLIGIBLE = 4.0
+"""Log posterior below the optimum's from which another bridge has no share of the first points: its
+density is a fiftieth, which shifts no interval of 95 %, and draws of both converge slowly."""
 _FIRST_POINTS = 320
 """Number of points of the first surface, which only locates the points of the second."""
+
+
+class ResidualDraws(NamedTuple):
+    """Draws weighted by the residuals."""
+
+    weighted: WeightedDraws  # of the curved coordinates and the offset, (k, n + 1)
+    evaluations: int
+    points: FloatArray | None
+    """Points (k, n + 1) of a surface for fusion, about all likely bridges; None if there is one."""
 
 
 class SurfacePosterior(NamedTuple):
@@ -85,8 +99,8 @@ def nuisances_on(found: Optimum, points: FloatArray) -> Nuisances:
 
 def drawn_by_residuals(
     found: Optimum, draws: int, seed: int, inflation: float, report: Report
-) -> tuple[WeightedDraws, int]:
-    """Return weighted draws (k, n + 1) by the residuals themselves, and their evaluations."""
+) -> ResidualDraws:
+    """Return draws by the residuals themselves, also about rivals of the optimum."""
     nuisances = nuisances_at_optimum(found, inflation, seed)
     curved = curved_coordinates(found)
     half_normal = np.searchsorted(curved, posterior.layout(found.problem).half_normal)
@@ -97,11 +111,34 @@ def drawn_by_residuals(
         LatentCoordinates(half_normal, odds),
         inflation,
     )
-    first = _points_of_normal(found, batch_size(draws), _WIDER * inflation, seed)
+    rivals, evaluations = _likely_rivals(found, nuisances, density)
+    first = _points_about_all([found, *rivals], batch_size(draws), _WIDER * inflation, seed)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 25,)))
     weighted = residual_draws(density, first, draws, rng, report)
-    points = first.shape[0] + weighted.y.shape[0]
-    return weighted, nuisances.evaluations + 2 * points
+    evaluations += nuisances.evaluations + 2 * (first.shape[0] + weighted.y.shape[0])
+    points = _points_about_all([found, *rivals], POINTS, inflation, seed) if rivals else None
+    return ResidualDraws(weighted, evaluations, points)
+
+
+def _likely_rivals(
+    found: Optimum, nuisances: Nuisances, density: DrawnDensity
+) -> tuple[list[Optimum], int]:
+    """Return the rivals of an optimum that are not negligible, as optima; and evaluations.
+
+    Their nuisances follow them, as in the posterior that is drawn.
+    """
+    if not found.rivals:
+        return [], 0
+    drawn = np.stack([found.state.y, *found.rivals])[:, nuisances.kept]
+    log_posterior = log_density(density, drawn, np.sum(density.residuals(drawn) ** 2, axis=0))
+    points = followed(nuisances, drawn, has_step=True)
+    rows = partial(posterior.all_rows, found.problem)
+    likely = [
+        found._replace(state=initial_state(rows, points[k]))
+        for k in range(1, len(drawn))
+        if log_posterior[k] > log_posterior[0] - _NEGLIGIBLE
+    ]
+    return likely, 3 * len(drawn) + len(likely) * (found.state.y.size + 1)
 
 
 def _prior_centres(found: Optimum) -> FloatArray:
@@ -159,8 +196,22 @@ def _points_of_normal(found: Optimum, count: int, inflation: float, seed: int) -
     near = near._replace(log_odds=_never_absent(near.log_odds))
     kept = np.append(curved_coordinates(found), place_of_offset(found.problem))
     chains = convergence.CHAINS
-    drawn = [compliances.draws(near, count // chains, seed, chain) for chain in range(chains)]
+    drawn = [compliances.draws(near, -(-count // chains), seed, chain) for chain in range(chains)]
     return np.concatenate(drawn)[:, kept]
+
+
+def _points_about_all(optima: list[Optimum], count: int, inflation: float, seed: int) -> FloatArray:
+    """Return points (k, n + 1) of normals about optima, `count` at least, half about the first."""
+    if len(optima) == 1:
+        return _points_of_normal(optima[0], count, inflation, seed)
+    each = -(-count // (2 * len(optima) - 2))
+    counts = [-(-count // 2), *([each] * (len(optima) - 1))]
+    return np.concatenate(
+        [
+            _points_of_normal(one, number, inflation, seed)
+            for one, number in zip(optima, counts, strict=True)
+        ]
+    )
 
 
 def _never_absent(log_odds: FloatArray) -> FloatArray:

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from pre_core.arrays import FloatArray
+from pre_core.crossing import surface_posterior
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.frequency_continuation import (
+    _RIVAL,
     _STAGES_HZ,
     _ContinuedFit,
     _coordinates,
@@ -13,7 +16,10 @@ from pre_core.crossing.frequency_continuation import (
 )
 from pre_core.crossing.optimum import WITH_MISMATCH
 from pre_core.crossing.posterior import layout
+from pre_core.crossing.response_surface import POINTS
+from pre_core.crossing.weighted_draws import WeightedDraws
 from pre_core.parameters import RHO_A
+from pre_core.search.importance import pareto_smooth
 from tests.numerics.single_tyres import at_its_truth
 
 STRATEGY = WITH_MISMATCH[0]
@@ -60,27 +66,58 @@ def test_low_frequencies_first_reach_a_bridge_that_all_at_once_miss(truth: Optim
     far = at_nominal_bridge(truth)
     at = _coordinates(far.problem)
     fit = _ContinuedFit(far.problem, far.state.y, STRATEGY, at)
-    best = fit.run(np.append(truth.state.y[at.places], 0.0), ())
+    best, _ = fit.run(np.append(truth.state.y[at.places], 0.0), ())
     start = np.zeros(at.places.size + 1)
     start[np.flatnonzero(np.flatnonzero(far.problem.priors.estimated)[at.places] == RHO_A)] = 2.0
-    at_once, by_stages = fit.run(start, ()), fit.run(start, _STAGES_HZ)
-    assert at_once.objective > best.objective + 10.0
-    assert by_stages.objective < best.objective + 1.0
+    (at_once, _), (by_stages, _) = fit.run(start, ()), fit.run(start, _STAGES_HZ)
+    assert at_once > best + 10.0
+    assert by_stages < best + 1.0
 
 
-def test_other_bridges_are_better_distinct_and_sorted(truth: Optimum) -> None:
+def test_other_bridges_are_distinct_and_sorted(truth: Optimum) -> None:
     others, evaluations = other_bridges(at_nominal_bridge(truth), STRATEGY, is_even=True)
     assert others
     assert evaluations > 100
-    objectives = [one.objective for one in others]
-    assert objectives == sorted(objectives)
+    gains = [one.gain for one in others]
+    assert gains == sorted(gains, reverse=True)
+    assert gains[-1] > -_RIVAL
     where = layout(truth.problem)
     inner = where.elements[1:-1]
     assert np.abs(others[0].y - truth.state.y)[inner].max() < 0.5
 
 
-def test_best_bridge_has_no_other(truth: Optimum) -> None:
+def test_best_bridge_has_rivals_only(truth: Optimum) -> None:
     others, _ = other_bridges(at_nominal_bridge(truth), STRATEGY, is_even=True)
     best = truth._replace(state=truth.state._replace(y=others[0].y))
     again, _ = other_bridges(best, STRATEGY, is_even=True)
-    assert all(one.objective > others[0].objective - 5.0 for one in again)
+    assert all(-_RIVAL < one.gain < 5.0 for one in again)
+
+
+def test_draws_begin_about_likely_rivals_only(
+    truth: Optimum, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where, y = layout(truth.problem), truth.state.y
+    near, far = y.copy(), y.copy()
+    near[where.elements[2]] += 0.02
+    far[where.elements] -= 2.0
+    begun: list[FloatArray] = []
+
+    def noted(_: object, first: FloatArray, *__: object) -> WeightedDraws:
+        begun.append(first)
+        return WeightedDraws(first, pareto_smooth(np.zeros(len(first))))
+
+    monkeypatch.setattr(surface_posterior, "residual_draws", noted)
+
+    def drawn(*rivals: FloatArray) -> surface_posterior.ResidualDraws:
+        found = truth._replace(rivals=rivals)
+        return surface_posterior.drawn_by_residuals(found, 300, 7, 1.0, lambda *_: None)
+
+    alone, with_far, with_near = drawn(), drawn(far), drawn(near)
+    assert alone.points is None
+    assert with_far.points is None
+    np.testing.assert_array_equal(begun[0], begun[1])
+    assert with_near.points is not None
+    assert with_near.points.shape[0] >= POINTS
+    assert begun[2].shape[0] >= begun[0].shape[0]
+    assert not np.array_equal(begun[2], begun[0])
+    assert with_near.evaluations > with_far.evaluations > alone.evaluations

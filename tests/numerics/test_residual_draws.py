@@ -95,3 +95,25 @@ def test_points_that_are_not_possible_are_never_drawn() -> None:
     weighted = drawn(residuals, LatentCoordinates(np.zeros(0, dtype=np.int64), NEVER_ZERO))
     assert weighted.worth.weight @ (weighted.y[:, 0] > 1.0) < 1e-12
     assert is_enough(weighted.worth, 1200)
+
+
+def test_two_bridges_are_drawn_by_their_masses() -> None:
+    """Of two minima six spreads apart, the other one is found only if points lie about it."""
+
+    def residuals(y: FloatArray) -> FloatArray:
+        return np.stack([4.0 * (y[:, 0] ** 2 - 1.0), 0.8 * (y[:, 0] + 1.0), 3.0 * y[:, 1]])
+
+    u = np.linspace(-3.0, 3.0, 6001)
+    squares = 16.0 * (u**2 - 1.0) ** 2 + 0.64 * (u + 1.0) ** 2 + u**2
+    share = np.exp(-0.5 * (squares - squares.min()))
+    right = float(share[u > 0.0].sum() / share.sum())
+    assert 0.1 < right < 0.4
+    density = DrawnDensity(
+        residuals, prior_squares, LatentCoordinates(np.zeros(0, dtype=np.int64), NEVER_ZERO), 1.0
+    )
+    rng = np.random.default_rng(3)
+    first = rng.standard_normal((COUNT, 2)) * [0.12, 0.3] + [-1.0, 0.0]
+    first[COUNT // 2 :, 0] += 2.0
+    weighted = residual_draws(density, first, 1200, rng, lambda stage, fraction: None)
+    assert is_enough(weighted.worth, 1200)
+    assert weighted.worth.weight @ (weighted.y[:, 0] > 0.0) == pytest.approx(right, abs=0.05)

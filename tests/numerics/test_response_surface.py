@@ -98,7 +98,7 @@ def test_the_surface_has_the_least_squares_of_the_residuals() -> None:
 def test_integrated_residuals_have_the_least_squares_of_all_residuals() -> None:
     """With alike tyres, whose draws they weight; over others single draws are 3 off."""
     found = at_its_truth(SINGLE)
-    weighted, _ = drawn_by_residuals(found, 300, 7, 1.0, lambda stage, fraction: None)
+    weighted = drawn_by_residuals(found, 300, 7, 1.0, lambda stage, fraction: None).weighted
     rng = np.random.default_rng(3)
     drawn = weighted.y[rng.choice(weighted.y.shape[0], DRAWS, p=weighted.worth.weight)]
     others = weighted.y[rng.choice(weighted.y.shape[0], 40, p=weighted.worth.weight)]

@@ -7,6 +7,7 @@ import pytest
 
 from pre_core.crossing import sampling
 from pre_core.crossing.sampling import PosteriorDraws
+from pre_core.crossing.surface_posterior import ResidualDraws
 from pre_core.crossing.weighted_draws import WeightedDraws
 from pre_core.search.importance import SmoothedWeights
 from pre_core.search.loop import Termination
@@ -20,7 +21,8 @@ def test_failed_draws_of_alike_tyres_keep_their_diagnostics(
 ) -> None:
     worth = SmoothedWeights(np.full(200, 1.0 / 200.0), 1.2, 12.0)
     weighted = WeightedDraws(np.zeros((200, 3)), worth)
-    monkeypatch.setattr(sampling, "drawn_by_residuals", lambda *given: (weighted, 407))
+    drawn = ResidualDraws(weighted, 407, None)
+    monkeypatch.setattr(sampling, "drawn_by_residuals", lambda *given: drawn)
     monkeypatch.setattr(sampling, "_compliance_draws", lambda *given: DRAWS)
     found: Any = None
     chains = sampling._alike_tyres_draws(found, 1200, 1, 1.0, lambda stage, fraction: None)

@@ -165,7 +165,8 @@ def test_other_bridges_are_tried_until_two_sets_of_starts_fail(
 
     def others(_: Any, __: Any, *, is_even: bool) -> tuple[list[Any], int]:
         sets.append(is_even)
-        return [SimpleNamespace(y=np.zeros(1)) for _ in range(3)], 10
+        gains = (3.0, 2.0, 1.0, -1.0)
+        return [SimpleNamespace(y=np.full(1, one), gain=one) for one in gains], 10
 
     monkeypatch.setattr(refinement, "other_bridges", others)
     monkeypatch.setattr(refinement, "_is_sharp", lambda _: True)
@@ -176,6 +177,8 @@ def test_other_bridges_are_tried_until_two_sets_of_starts_fail(
     assert best.chi2_per_dof == 3.0
     assert sets == [True, False, True]
     assert evaluations == 3 * 10 + 6
+    # Rivals of the last optimum are those of the two sets that failed.
+    assert [one[0] for one in best.rivals] == [3.0, 3.0, 2.0, 2.0]
 
 
 @pytest.mark.parametrize(
