@@ -279,8 +279,8 @@ def ros2_of(site: Site, site_name: str, vehicle: str) -> Ros2:
     if table.velocity is None and noise < _LEAST_SPEED_NOISE_M_PER_S:
         raise InputError(
             f"{site_name}: receiver.speed_noise_m_per_s is {noise:g}, it must be at least "
-            f"{_LEAST_SPEED_NOISE_M_PER_S:g} where [ros2] names no velocity: speeds are slopes "
-            "of positions then"
+            f"{_LEAST_SPEED_NOISE_M_PER_S:g} where [ros2] names no velocity: speeds are "
+            "then slopes of positions"
         )
     return table
 

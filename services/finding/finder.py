@@ -96,7 +96,7 @@ class Finder:
         self._recorded = frozenset(vehicles)
 
     def expect(self, key: Key, payload: bytes, *, for_ever: bool = False) -> None:
-        """Record a truck's position at its arrival: another truck may be on the bridge then.
+        """Record a truck's position at its arrival, when another may be on the bridge.
 
         It is called once for every message, of any stream, before the message is fed, which may be
         after another truck's; `for_ever` for a recording, in which nothing is too old. `feed`

@@ -40,7 +40,7 @@ _MEDIAN_OF_HALF_NORMAL = 0.6745
 _NEARBY = (1.0, 1.02, 0.97)
 """Factors of the speed to use where rounding leaves the residuals without noise.
 
-This occurs with unlike tyres, quiet sensors of 200 Hz and 11.5 m/s.
+This occurs with single and twin tyres, quiet sensors of 200 Hz and 11.5 m/s.
 """
 
 

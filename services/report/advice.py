@@ -56,7 +56,7 @@ def next_steps(report: BridgeReport, language: Language) -> Iterator[str]:
 
 
 def _other_truck(report: BridgeReport, language: Language) -> Iterator[str]:
-    """Yield which truck would help; only trucks of unlike tyres improve by other tyres."""
+    """Yield which truck would help; other tyres help only a truck with single and twin ones."""
     known = {one.id: one for one in report.site.vehicles}
     kinds = {truck_to_try(known[one.vehicle]) for one in report.used if one.vehicle in known}
     best = next((kind for kind in ("tandem", "single") if kind in kinds), "truck")
