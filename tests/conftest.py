@@ -23,7 +23,7 @@ settings.register_profile("project", deadline=None)
 settings.load_profile("project")
 
 PROJECT = Path(__file__).parents[1]
-pytest_plugins = ["tests.groups", "tests.left_out"]
+pytest_plugins = ["tests.groups", "tests.left_out", "tests.prepared"]
 
 
 @pytest.hookimpl(wrapper=True)

@@ -16,6 +16,7 @@ import pytest
 from schemas.topics import Message
 from services.common.errors import InputError
 from services.recordings.recording import is_closed, read_info, read_messages
+from tests import prepared
 from tests.endpoints import free_endpoint
 from tests.parent import parent_environment
 from tests.waiting import LONGEST_S
@@ -107,11 +108,10 @@ class Fleet:
 
     def python(self, script: str, *arguments: str, env: dict[str, str]) -> subprocess.Popen[str]:
         log = (self.folder / f"{Path(script).stem}-{len(self._processes)}.log").open("w")
-        process = subprocess.Popen(
+        process = prepared.Popen(
             [sys.executable, str(HERE / script), *arguments],
             stdout=subprocess.PIPE,
             stderr=log,
-            text=True,
             env=os.environ | {"PYTHONPATH": str(HERE.parents[1])} | parent_environment() | env,
         )
         log.close()

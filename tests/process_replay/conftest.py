@@ -27,6 +27,7 @@ from schemas.site_file import site_toml
 from schemas.topics import Key, Message
 from services.recordings.writer import write_recording
 from services.simulation.drive import paper_site
+from tests import prepared
 from tests.process_replay.starting import End, Process, Start
 from tests.waiting import LONGEST_S
 
@@ -70,11 +71,11 @@ def start() -> Iterator[Start]:
     started: list[Process] = []
 
     def start_one(module: str, **arguments: Any) -> Process:
-        process = subprocess.Popen(
+        process = prepared.Popen(
             [sys.executable, "-c", _RUNNER, module, json.dumps(arguments, default=str)],
+            has_server=module == "services.worker",
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            text=True,
         )
         started.append(process)
         if module == "services.logger":

@@ -27,6 +27,7 @@ from services.identification.bridge_state import (
 )
 from services.identification.engine import Engine
 from services.identification.outputs import FusionTask, IdentificationTask
+from tests import prepared
 from tests.identifications import Identifications
 from tests.unit.execution.in_processes import (
     after_a_signal,
@@ -90,10 +91,16 @@ def test_signals_to_the_group_are_left_to_the_parent_while_a_process_starts() ->
     assert not {signal.SIGINT, signal.SIGTERM} & signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
+# That test is of the start of a process that multiprocessing spawns; the others are of what becomes
+# of it, and a fork has no imports.
+forked = pytest.mark.usefixtures("forked_spawns")
+
+
 def pairs() -> Iterator[Any]:
     return ((m.key, m.payload) for m in TWO)
 
 
+@forked
 @pytest.mark.parametrize("number", [1, 2])
 def test_the_bytes_are_those_of_one_process(number: int) -> None:
     reported: list[tuple[str, str, float]] = []
@@ -120,6 +127,7 @@ def by_stream(outputs: list[Any]) -> list[Any]:
     return sorted(outputs, key=lambda o: (o.key.stream, o.payload * (o.key.stream == "crossing")))
 
 
+@forked
 def test_a_process_that_dies_twice_costs_its_own_crossing_only(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -135,6 +143,7 @@ def test_a_process_that_dies_twice_costs_its_own_crossing_only(
     assert sum("retrying once" in text for text in printed) == 1
 
 
+@forked
 def test_a_process_that_dies_once_costs_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -147,6 +156,7 @@ def test_a_process_that_dies_once_costs_nothing(
     assert len(list(tmp_path.iterdir())) == 2
 
 
+@forked
 @pytest.mark.parametrize(
     ("search", "limits", "why"),
     [
@@ -181,6 +191,7 @@ def test_a_hung_process_is_ended_and_its_crossing_fails_at_the_second_time(
     assert (results[second.number].verdict == "good") == (search is busy)
 
 
+@forked
 def test_a_process_that_is_hung_once_costs_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -192,6 +203,7 @@ def test_a_process_that_is_hung_once_costs_nothing(
     assert finished.result.verdict == "good"
 
 
+@forked
 def test_an_aside_that_is_hung_makes_room(caplog: pytest.LogCaptureFixture) -> None:
     (work, _) = works()
     with ProcessExecutor(
@@ -203,6 +215,7 @@ def test_an_aside_that_is_hung_makes_room(caplog: pytest.LogCaptureFixture) -> N
     assert finished.result.verdict == "good"
 
 
+@forked
 def test_an_error_in_a_process_is_a_verdict(caplog: pytest.LogCaptureFixture) -> None:
     (work, _) = works()
     with ProcessExecutor(1, identify=broken, prepare=nothing) as processes:
@@ -213,6 +226,7 @@ def test_an_error_in_a_process_is_a_verdict(caplog: pytest.LogCaptureFixture) ->
     assert "singular" in caplog.text
 
 
+@forked
 def test_a_process_that_cannot_begin_is_a_failure() -> None:
     with (
         ProcessExecutor(1, identify=quick, prepare=die) as processes,
@@ -221,6 +235,7 @@ def test_a_process_that_cannot_begin_is_a_failure() -> None:
         processes.wait_until_warm()
 
 
+@forked
 def test_a_process_that_hangs_while_it_is_started_is_ended(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -233,6 +248,7 @@ def test_a_process_that_hangs_while_it_is_started_is_ended(
     assert "the process that is being started has done nothing for 1 s; ending it" in caplog.text
 
 
+@forked
 def test_one_that_hangs_at_a_later_start_costs_one_crossing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -253,6 +269,7 @@ def test_one_that_hangs_at_a_later_start_costs_one_crossing(
     assert caplog.text.count("the process that is being started has done nothing") == 1
 
 
+@forked
 def test_more_than_a_few_wait_elsewhere() -> None:
     (work, _) = works()
     with ProcessExecutor(1, identify=slow, prepare=nothing) as processes:
@@ -294,7 +311,7 @@ def test_no_process_outlives_its_parent(end: str) -> None:
     One that is frozen sees nothing of that, and its starter would wait for it when it ends.
     """
     command = [sys.executable, "-c", STARTER, end]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as starter:
+    with prepared.Popen(command, has_server=True, stdout=subprocess.PIPE) as starter:
         assert starter.stdout is not None
         pid = int(starter.stdout.readline())
         if end == "kill":
@@ -359,6 +376,7 @@ def all_fused(processes: ProcessExecutor) -> list[tuple[str, int | None]]:
     return found
 
 
+@forked
 def test_of_one_bridge_only_the_newest_waits_while_one_is_fused(marks: Path) -> None:
     """The first is under way; of the three behind it only the last is fused."""
     with ProcessExecutor(2, identify=quick, state_of=after_a_signal, prepare=nothing) as processes:
@@ -377,6 +395,7 @@ def test_of_one_bridge_only_the_newest_waits_while_one_is_fused(marks: Path) -> 
     assert found.index(("bridge-1", 1)) < found.index(("bridge-1", 4))
 
 
+@forked
 def test_a_state_comes_before_the_crossings_that_wait(marks: Path) -> None:
     first, second = works()
     with ProcessExecutor(1, identify=quick, state_of=named_by_number, prepare=nothing) as processes:
@@ -397,6 +416,7 @@ def test_a_state_comes_before_the_crossings_that_wait(marks: Path) -> None:
     assert begun(marks) == ["bridge-1 1"]
 
 
+@forked
 @pytest.mark.parametrize(
     ("make", "limits"),
     [(dies, TaskLimits()), (for_ever, TaskLimits(idle_s=1.0)), (bad, TaskLimits())],
@@ -421,6 +441,7 @@ def test_what_cannot_be_fused_costs_its_own_state_only(
     assert any("the state of bridge-1 died again" in text for text in printed) == (make is not bad)
 
 
+@forked
 def test_a_process_that_dies_once_while_it_fuses_costs_nothing(marks: Path) -> None:
     """Meanwhile a newer set has come: that is the one that is tried."""
     with ProcessExecutor(1, identify=quick, state_of=dies_once, prepare=nothing) as processes:
@@ -429,6 +450,7 @@ def test_a_process_that_dies_once_while_it_fuses_costs_nothing(marks: Path) -> N
         assert all_fused(processes) == [("bridge-1", 2)]
 
 
+@forked
 def test_numbers_of_a_state_are_those_of_this_process() -> None:
     """To the last bit, of a fusion that has something to fuse."""
     three = [usable(crossing(number)) for number in range(3)]
@@ -457,6 +479,7 @@ def until_over(processes: ProcessExecutor, number: int) -> list[BackgroundResult
     return found
 
 
+@forked
 def test_what_is_computed_aside_comes_back_and_keeps_nobody_waiting() -> None:
     with ProcessExecutor(2, identify=quick, prepare=nothing) as processes:
         assert processes.wants_background
@@ -470,6 +493,7 @@ def test_what_is_computed_aside_comes_back_and_keeps_nobody_waiting() -> None:
     assert {(task.name, outcome) for task, outcome in found} == {("one", 2), ("other", 4)}
 
 
+@forked
 @pytest.mark.parametrize("run", [die, no_answer])
 def test_what_cannot_be_computed_aside_costs_nothing_else(run: Callable[[], None]) -> None:
     (work, _) = works()
@@ -482,6 +506,7 @@ def test_what_cannot_be_computed_aside_costs_nothing_else(run: Callable[[], None
     assert finished.result.verdict == "good"
 
 
+@forked
 def test_a_crossing_comes_before_whatever_waits_aside(tmp_path: Path) -> None:
     """Three wait; the crossing that comes then waits for the first only."""
     (work, _) = works()
