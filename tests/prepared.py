@@ -27,7 +27,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, TextIO
 
 import pytest
 
@@ -218,10 +218,20 @@ def _become(request: Request, descriptors: list[int], end: socket.socket) -> Non
     os.environ.clear()
     os.environ.update(request.environment)
     os.chdir(request.folder)
-    if os.environ.get("PYTHONUNBUFFERED"):
-        for stream in (sys.stdout, sys.stderr):
-            stream.reconfigure(write_through=True)  # type: ignore[union-attr]
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        setattr(sys, name, _stream(number, getattr(sys, name)))
+        setattr(sys, f"__{name}__", getattr(sys, name))
     signal.pthread_sigmask(signal.SIG_SETMASK, request.blocked)
+
+
+def _stream(number: int, before: TextIO) -> TextIO:
+    """Return a standard stream as Python opens it for a descriptor."""
+    stream = open(  # noqa: SIM115
+        number, before.mode, encoding=before.encoding, errors=before.errors, closefd=False
+    )
+    is_at_once = bool(os.environ.get("PYTHONUNBUFFERED"))
+    stream.reconfigure(line_buffering=number == 2 or stream.isatty(), write_through=is_at_once)
+    return stream
 
 
 def _above(descriptors: list[int]) -> list[int]:

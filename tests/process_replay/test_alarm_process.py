@@ -31,6 +31,7 @@ from services.common.files import make_folder, write_atomically
 from services.history.alarm_files import alarms_folder
 from services.history.history_store import add_results
 from services.viewer.view import viewer_program
+from tests import prepared
 from tests.endpoints import free_port
 from tests.fleet import losses_of
 from tests.process_replay.starting import Start, start_logger
@@ -110,12 +111,11 @@ class RunningCommand:
 
     def __init__(self, *words: str) -> None:
         self.lines: list[str] = []
-        self._process = subprocess.Popen(
+        self._process = prepared.Popen(
             [sys.executable, "-m", "driveby", *words],
             env={**os.environ, "PYTHONUNBUFFERED": "1"},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            text=True,
         )
         self._reading = threading.Thread(target=self._read)
         self._reading.start()

@@ -30,7 +30,7 @@ from services.drives.signals import Signals, signals_of_recording
 from services.recordings.recording import read_messages
 from services.simulation.drive import paper_site
 from services.truck import ros2 as gateway_of_ros2
-from tests import ros2
+from tests import prepared, ros2
 from tests.builders.processes import stop
 from tests.endpoints import free_endpoint
 from tests.process_replay.starting import End, Process, Start, start_logger
@@ -93,7 +93,7 @@ def gateway(ros_endpoint: str, endpoint: str, ros_site: Path) -> Iterator[Callab
     started: list[Process] = []
 
     def start(*options: str) -> Process:
-        process = subprocess.Popen(
+        process = prepared.Popen(
             [
                 *(sys.executable, "-m", "driveby", "gateway", "ros2", "--ros", ros_endpoint),
                 *("--endpoint", endpoint, "--site", str(ros_site), "--realm", "sim-ros"),
@@ -101,7 +101,6 @@ def gateway(ros_endpoint: str, endpoint: str, ros_site: Path) -> Iterator[Callab
             ],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            text=True,
         )
         started.append(process)
         assert process.stdout is not None

@@ -25,6 +25,7 @@ from services.security.certs import certs_command
 from services.security.settings import CertsSettings
 from services.truck.gateway import Gateway
 from services.truck.spool import Spool
+from tests import prepared
 from tests.builders.commands import run
 from tests.builders.processes import stop
 from tests.waiting import LONGEST_S, until
@@ -40,11 +41,11 @@ def driveby() -> Iterator[Driveby]:
     started: list[subprocess.Popen[str]] = []
 
     def start(*arguments: object) -> subprocess.Popen[str]:
-        process = subprocess.Popen(
+        process = prepared.Popen(
             [sys.executable, "-m", "services", *map(str, arguments)],
+            has_server=arguments[0] == "worker",
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            text=True,
         )
         started.append(process)
         if arguments[0] == "logger":
