@@ -113,7 +113,11 @@ def drawn_way(seed: int) -> Callable[[Floats], tuple[Floats, Floats]]:
     return place
 
 
-@pytest.mark.parametrize("seed", range(60))
+# Each is a drive of its own; the second thirty are for `make test-all`.
+DRIVES = [*range(30), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(30, 60))]
+
+
+@pytest.mark.parametrize("seed", DRIVES)
 def test_skipped_recheck_would_give_the_same_result(seed: int) -> None:
     """After every fix of a drive in which the receiver is out now and then."""
     drive = fixes(drawn_way(seed), 40.0)
