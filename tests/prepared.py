@@ -1,9 +1,9 @@
 """Processes that are forked from one with everything imported, for tests that start many.
 
 Importing numpy, numba, scipy and the services and loading the kernels takes seconds of a processor
-for each process. A process of this module has its own arguments, environment, folder, descriptors
-and signal mask, and is a child of the caller, as if it had been executed. It is no test of how a
-command starts: such tests use `subprocess`.
+for each process. A process of this module has its own arguments, environment, folder, descriptors,
+limits of resources and signal mask, and is a child of the caller, as if it had been executed. It is
+no test of how a command starts: such tests use `subprocess`.
 
 Each test process has one server, which has no threads, so that a fork of it is sound. A fork is
 adopted by the caller, the "child subreaper" while it starts.
@@ -12,9 +12,11 @@ adopted by the caller, the "child subreaper" while it starts.
 import ctypes
 import gc
 import importlib
+import io
 import json
 import multiprocessing.util
 import os
+import resource
 import runpy
 import signal
 import socket
@@ -46,7 +48,7 @@ _LARGEST_REQUEST = 100_000
 _MOST_DESCRIPTORS = 64
 _ABOVE_ALL = 500
 """Number of a descriptor beyond those that anybody asks for."""
-_SPAWN = multiprocessing.util.spawnv_passfds
+_LIMITED = [number for name, number in vars(resource).items() if name.startswith("RLIMIT_")]
 
 
 class Request(NamedTuple):
@@ -58,6 +60,8 @@ class Request(NamedTuple):
     parent: int
     blocked: list[int]
     """Signals."""
+    limits: list[list[int]]
+    """Of resources, with the number of each."""
     numbers: list[int]
     """Of the descriptors that come with the request, in the process."""
     has_server: bool
@@ -89,8 +93,16 @@ class Server:
     ) -> int:
         """Return the process id of a new child; `descriptors` are ours, by its numbers."""
         blocked = [int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, ())]
+        limits = [[number, *resource.getrlimit(number)] for number in _LIMITED]
         request = Request(
-            [*words], {**environment}, folder, os.getpid(), blocked, [*descriptors], has_server
+            [*words],
+            {**environment},
+            folder,
+            os.getpid(),
+            blocked,
+            limits,
+            [*descriptors],
+            has_server,
         )
         with self._lock, _adopting():
             text = json.dumps(request).encode()
@@ -221,14 +233,16 @@ def _become(request: Request, descriptors: list[int], end: socket.socket) -> Non
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         setattr(sys, name, _stream(number, getattr(sys, name)))
         setattr(sys, f"__{name}__", getattr(sys, name))
+    for number, *limit in request.limits:
+        if resource.getrlimit(number) != tuple(limit):
+            resource.setrlimit(number, (limit[0], limit[1]))
     signal.pthread_sigmask(signal.SIG_SETMASK, request.blocked)
 
 
 def _stream(number: int, before: TextIO) -> TextIO:
     """Return a standard stream as Python opens it for a descriptor."""
-    stream = open(  # noqa: SIM115
-        number, before.mode, encoding=before.encoding, errors=before.errors, closefd=False
-    )
+    below = open(number, "rb" if number == 0 else "wb", closefd=False)  # noqa: SIM115
+    stream = io.TextIOWrapper(below, encoding=before.encoding, errors=before.errors)
     is_at_once = bool(os.environ.get("PYTHONUNBUFFERED"))
     stream.reconfigure(line_buffering=number == 2 or stream.isatty(), write_through=is_at_once)
     return stream
