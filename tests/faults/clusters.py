@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from schemas.results import load_results
 from services.common.parquet_files import decoded
 from services.execution.result_store import EDITION, KEY, files_of
+from tests import prepared
 from tests.endpoints import free_port
 from tests.parent import parent_environment
 from tests.waiting import LONGEST_S, until
@@ -45,11 +46,10 @@ class RunningCluster(NamedTuple):
 
 def start(log: Path, *arguments: str, env: dict[str, str] | None = None) -> Running:
     with log.open("w") as file:
-        process = subprocess.Popen(
+        process = prepared.Popen(
             [sys.executable, str(COMMAND), *arguments],
             stdout=file,
             stderr=subprocess.STDOUT,
-            text=True,
             cwd=log.parent,
             env=os.environ | {"PYTHONPATH": str(PROJECT)} | parent_environment() | (env or {}),
         )
