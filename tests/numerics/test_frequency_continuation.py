@@ -22,6 +22,8 @@ from pre_core.parameters import RHO_A
 from pre_core.search.importance import pareto_smooth
 from tests.numerics.single_tyres import at_its_truth
 
+# They share a crossing at its truth, which takes seconds.
+pytestmark = pytest.mark.xdist_group("at its truth")
 STRATEGY = WITH_MISMATCH[0]
 
 

@@ -1,5 +1,7 @@
 """Errors by short waves of the mismatch: their response, and what runs on one path share."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -18,6 +20,8 @@ from pre_core.physics.simulate import rear_position_m
 from tests.numerics.single_tyres import at_its_truth
 from tests.numerics.whitened import white_rows
 
+# They share a crossing at its truth, which takes seconds.
+pytestmark = pytest.mark.xdist_group("at its truth")
 ELEMENTS = 5
 
 
@@ -48,6 +52,7 @@ def test_the_transposed_factor() -> None:
     assert np.allclose(dense[:, 5:].T @ back, y)
 
 
+@cache
 def crossing() -> CrossingLikelihood:
     return likelihood(at_its_truth())
 
