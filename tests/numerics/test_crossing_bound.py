@@ -131,7 +131,7 @@ def test_roads_that_differ_are_noise_at_the_truth() -> None:
     lengths_m = np.array(world.site.bridges[0].lengths_m)
     once, often, apart = (
         bound_of_runs([PosteriorAtTruth(problem, y)] * runs, wander_m, lengths_m, 0.01)
-        for runs, wander_m in ((1, 0.12), (16, 0.12), (16, 1.0))
+        for runs, wander_m in ((1, 0.12), (6, 0.12), (6, 1.0))
     )
     assert 0.08 < once.level < 0.2
     assert np.median(apart.elements) < np.median(often.elements) < np.median(once.elements)
