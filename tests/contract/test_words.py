@@ -102,11 +102,12 @@ def test_no_summary_begins_without_a_head(modules: list[Module]) -> None:
 
 
 def test_code_avoids_the_verb_tell(modules: list[Module]) -> None:
+    # Modules without the verb need not be parsed.
     laboratory = [
-        module_of(path.relative_to(ROOT).as_posix(), path.read_text())
+        module_of(path.relative_to(ROOT).as_posix(), text)
         for folder in ("tests", "studies")
         for path in sorted((ROOT / folder).rglob("*.py"))
-        if path != Path(__file__)
+        if path != Path(__file__) and NOT_A_VERB_FOR_CODE.search(text := path.read_text())
     ]
     assert [line for module in (*modules, *laboratory) for line in tellings(module)] == []
 

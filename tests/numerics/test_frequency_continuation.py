@@ -9,6 +9,7 @@ from pre_core.crossing.fit import Optimum
 from pre_core.crossing.frequency_continuation import (
     _RIVAL,
     _STAGES_HZ,
+    OtherBridge,
     _ContinuedFit,
     _coordinates,
     _starts,
@@ -37,6 +38,15 @@ def at_nominal_bridge(truth: Optimum) -> Optimum:
     y = truth.state.y.copy()
     y[layout(truth.problem).bridge] = 0.0
     return truth._replace(state=truth.state._replace(y=y))
+
+
+Better = tuple[list[OtherBridge], int]
+
+
+@pytest.fixture(scope="module")
+def better(truth: Optimum) -> Better:
+    """Return the bridges better than the nominal one, and the number of evaluations."""
+    return other_bridges(at_nominal_bridge(truth), STRATEGY, is_even=True)
 
 
 def test_coordinates_are_undone(truth: Optimum) -> None:
@@ -76,8 +86,8 @@ def test_low_frequencies_first_reach_a_bridge_that_all_at_once_miss(truth: Optim
     assert by_stages < best + 1.0
 
 
-def test_other_bridges_are_distinct_and_sorted(truth: Optimum) -> None:
-    others, evaluations = other_bridges(at_nominal_bridge(truth), STRATEGY, is_even=True)
+def test_other_bridges_are_distinct_and_sorted(truth: Optimum, better: Better) -> None:
+    others, evaluations = better
     assert others
     assert evaluations > 100
     gains = [one.gain for one in others]
@@ -88,8 +98,8 @@ def test_other_bridges_are_distinct_and_sorted(truth: Optimum) -> None:
     assert np.abs(others[0].y - truth.state.y)[inner].max() < 0.5
 
 
-def test_best_bridge_has_rivals_only(truth: Optimum) -> None:
-    others, _ = other_bridges(at_nominal_bridge(truth), STRATEGY, is_even=True)
+def test_best_bridge_has_rivals_only(truth: Optimum, better: Better) -> None:
+    others, _ = better
     best = truth._replace(state=truth.state._replace(y=others[0].y))
     again, _ = other_bridges(best, STRATEGY, is_even=True)
     assert all(-_RIVAL < one.gain < 5.0 for one in again)
