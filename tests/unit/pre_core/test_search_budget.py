@@ -371,3 +371,33 @@ def test_offsets_are_scanned_as_if_the_front_axle_were_known(
     monkeypatch.setattr(optimum, "_no_optimum", lambda *_, **__: found(0.0, 1))
     optimum._refine_likeliest(problem, np.zeros(1), STRATEGY, lambda *_: None, BUDGET)
     assert seen == [None, None, "its spectra"]
+
+
+@pytest.mark.parametrize(
+    ("accepted", "free", "limits"),
+    [
+        (True, False, [fit._MAX_STEPS, fit._MORE_STEPS]),
+        (False, False, [fit._MAX_STEPS]),
+        (True, True, [fit._EARLY_STEPS]),
+    ],
+)
+def test_fit_continues_where_its_steps_end_near_a_minimum(
+    accepted: bool, free: bool, limits: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem: Any = SimpleNamespace(mismatch=SimpleNamespace(level_m3=np.ones(1)))
+    taken: list[int] = []
+
+    def steps(_: Any, y: Any, __: Any, ___: float, most: int, *____: Any, **_____: Any) -> Any:
+        taken.append(most)
+        ending = Termination.CONVERGED if len(taken) == 2 else Termination.STEPS_EXHAUSTED
+        return problem, y, ending, 10 * most
+
+    monkeypatch.setattr(fit, "_fit_in_noise_steps", steps)
+    monkeypatch.setattr(fit, "chi2_per_dof", lambda *_: 1.0)
+    monkeypatch.setattr(fit, "is_accepted", lambda *_: accepted)
+    *_, ending, used = fit._fit_in_noise_rounds(
+        problem, np.zeros(1), np.eye(1), 6, lambda one, y: one, is_free=free
+    )
+    assert taken == limits
+    assert used == 10 * sum(limits)
+    assert (ending is Termination.CONVERGED) == (len(limits) == 2)
