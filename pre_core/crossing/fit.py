@@ -340,15 +340,14 @@ def _fit_in_noise_rounds(
     temperature, steps, enough = _FREE_STAGES[-1]
     evaluations = 0
     if problem.mismatch.level_m3.any():
-        most = _EARLY_STEPS if is_free else _MAX_STEPS
-        problem, y, ending, evaluations = _fit_in_noise_steps(
-            problem, y, directions, temperature, most, refresh_noise, is_free=is_free
-        )
-        is_last = is_free or ending is not Termination.STEPS_EXHAUSTED
-        if not is_last and is_accepted(problem, chi2_per_dof(problem, y)):
-            more = (directions, temperature, _MORE_STEPS, refresh_noise)
-            problem, y, ending, used = _fit_in_noise_steps(problem, y, *more)
+        for most in (_EARLY_STEPS,) if is_free else (_MAX_STEPS, _MORE_STEPS):
+            problem, y, ending, used = _fit_in_noise_steps(
+                problem, y, directions, temperature, most, refresh_noise, is_free=is_free
+            )
             evaluations += used
+            is_done = ending is not Termination.STEPS_EXHAUSTED
+            if is_done or not is_accepted(problem, chi2_per_dof(problem, y)):
+                break
         if problem.mismatch.level_m3.any():
             return problem, y, ending, evaluations
     chi2 = np.inf

@@ -131,14 +131,11 @@ def _likely_rivals(
         return [], 0
     drawn = np.stack([found.state.y, *found.rivals])[:, nuisances.kept]
     log_posterior = log_density(density, drawn, np.sum(density.residuals(drawn) ** 2, axis=0))
-    points = followed(nuisances, drawn, has_step=True)
+    is_likely = log_posterior[1:] > log_posterior[0] - _NEGLIGIBLE
+    points = followed(nuisances, drawn[1:][is_likely], has_step=True)
     rows = partial(posterior.all_rows, found.problem)
-    likely = [
-        found._replace(state=initial_state(rows, points[k]))
-        for k in range(1, len(drawn))
-        if log_posterior[k] > log_posterior[0] - _NEGLIGIBLE
-    ]
-    return likely, 3 * len(drawn) + len(likely) * (found.state.y.size + 1)
+    likely = [found._replace(state=initial_state(rows, y)) for y in points]
+    return likely, 2 * len(drawn) + len(likely) * (found.state.y.size + 2)
 
 
 def _prior_centres(found: Optimum) -> FloatArray:
