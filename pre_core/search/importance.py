@@ -19,6 +19,8 @@ LogDensity = Callable[[FloatArray], FloatArray]
 
 _MAX_ROUNDS, _SAME_SCALE = 50, 1e-6
 """Limit of the rounds in which densities are scaled alike, and the change that ends them."""
+_NOTHING = 1e-300
+"""Density relative to the highest at a point below which it does not matter."""
 
 
 class SmoothedWeights(NamedTuple):
@@ -45,13 +47,17 @@ def mixture_log_weights(
         own = slice(stop - count, stop)
         log_mean = logsumexp(log_target[own] - log_density[own, r]) - log_counts[r]
         log_scale[r] = -log_mean if np.isfinite(log_mean) else np.median(log_density[own, r])
+    # Each density is taken relative to the highest at its draw, so that no round needs logarithms.
+    scaled = log_density - log_scale
+    highest = scaled.max(axis=1)
+    density = np.maximum(np.exp(scaled - highest[:, None]), _NOTHING)
+    moved = np.zeros(counts.size)
     for _ in range(_MAX_ROUNDS):
-        log_mixture = logsumexp(log_density - log_scale + log_counts, axis=1)
-        change = logsumexp(log_density - log_mixture[:, None], axis=0) - log_scale
-        log_scale += change
-        if np.ptp(change) < _SAME_SCALE:
+        mixture = density @ (counts * np.exp(moved.min() - moved))
+        last, moved = moved, np.log(density.T @ (1.0 / mixture))
+        if np.ptp(moved - last) < _SAME_SCALE:
             break
-    return np.asarray(log_target - log_mixture)
+    return np.asarray(log_target - highest - np.log(mixture))
 
 
 def systematic_resample(

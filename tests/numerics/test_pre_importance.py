@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from scipy.integrate import dblquad, quad
+from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from pre_core.arrays import FloatArray
@@ -126,6 +127,22 @@ def test_weights_of_a_mixture_know_its_shares() -> None:
     assert float(worth.weight @ x**2) == pytest.approx(1.0, abs=DEVIATIONS * np.sqrt(2 / worth.ess))
     alone = importance.pareto_smooth(found[:3000])  # with the narrow one alone
     assert abs(float(alone.weight @ x[:3000] ** 2) - 1.0) > 0.1
+
+
+@pytest.mark.parametrize("far", [1.0, 2.0, 300.0])
+def test_densities_of_a_mixture_have_their_shares_whatever_their_constants(far: float) -> None:
+    """Every density's share of the weights is its share of the draws: Shirts and Chodera's (11)."""
+    rng = np.random.default_rng(3)
+    counts = np.array([300, 400, 500])
+    centres = far * np.array([0.0, 0.7, -1.0])
+    which = np.repeat(np.arange(3), counts)
+    x = centres[which] + rng.standard_normal(which.size)
+    log_density = -0.5 * (x[:, None] - centres) ** 2 + far * np.array([0.0, 40.0, -900.0])
+    found = importance.mixture_log_weights(np.zeros(x.size), log_density, counts)
+    # With a target of one, the weights are the inverse of the mixture.
+    shares = np.array([logsumexp(found + log_density[:, r]) for r in range(3)])
+    scaled = log_density - shares + np.log(counts)
+    np.testing.assert_allclose(np.ptp(logsumexp(scaled, axis=1) + found), 0.0, atol=1e-5)
 
 
 def test_impossible_points_weigh_nothing_in_a_mixture() -> None:
