@@ -12,7 +12,7 @@ Truck and trajectory follow to first order, except for the offset.
 
 from collections.abc import Iterator
 from itertools import product
-from operator import itemgetter
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -114,14 +114,22 @@ def other_bridges(
         *((one, _STAGES_HZ) for one in _starts(at, is_even=is_even)),
     ]
     tried = [fit.run(start, stages) for start, stages in starts]
-    distinct = [y]
-    others = []
-    for objective, moved in sorted(tried, key=itemgetter(0)):
-        apart = [np.abs(moved - other)[[*at.places, -1]].max() for other in distinct]
-        if objective < level + _RIVAL and min(apart) > _SAME_BRIDGE:
-            distinct.append(moved)
-            others.append(OtherBridge(level - objective, moved))
-    return others, fit.evaluations
+    others = [OtherBridge(level - objective, moved) for objective, moved in tried]
+    near = [one for one in others if one.gain > -_RIVAL]
+    return distinct_bridges(found, near), fit.evaluations
+
+
+def distinct_bridges(found: Optimum, others: list[OtherBridge]) -> list[OtherBridge]:
+    """Return the bridges that differ from an optimum's and from better ones, best first."""
+    places = [*layout(found.problem).bridge, place_of_offset(found.problem)]
+    known = [found.state.y[places]]
+    distinct = []
+    for other in sorted(others, key=attrgetter("gain"), reverse=True):
+        bridge = other.y[places]
+        if min(np.abs(bridge - one).max() for one in known) > _SAME_BRIDGE:
+            known.append(bridge)
+            distinct.append(other)
+    return distinct
 
 
 def _coordinates(problem: PosteriorProblem) -> _Coordinates:

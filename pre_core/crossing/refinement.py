@@ -10,7 +10,12 @@ from pre_core.crossing.fit import (
     complete_fit,
     fit_all,
 )
-from pre_core.crossing.frequency_continuation import ENOUGH, OtherBridge, other_bridges
+from pre_core.crossing.frequency_continuation import (
+    ENOUGH,
+    OtherBridge,
+    distinct_bridges,
+    other_bridges,
+)
 from pre_core.crossing.mismatch import has_alike_tyres
 from pre_core.crossing.posterior import has_tandem, layout
 from pre_core.crossing.walk import better_neighbour, shifted_to
@@ -69,8 +74,8 @@ def _with_other_bridge(
         is_same = found is before
         failed, rivals = (failed + 1, [*rivals, *others]) if is_same else (0, [])
         is_even = not is_even
-    rivals.sort(key=lambda one: -one.gain)
-    return found._replace(rivals=tuple(one.y for one in rivals[:_KEPT_RIVALS])), evaluations
+    distinct = distinct_bridges(found, rivals)[:_KEPT_RIVALS]
+    return found._replace(rivals=tuple(one.y for one in distinct)), evaluations
 
 
 def _refine_offset(
