@@ -119,13 +119,15 @@ def find_optimum(inputs: CrossingInputs, report: Report = lambda stage, fraction
     Its `ending` is STEPS_EXHAUSTED if the search took more than `_MAX_EVALUATIONS` without a fit.
     """
     problem, y = build_problem(inputs)
-    found = _run_strategies(problem, y, report, _MAX_EVALUATIONS)
-    while not _is_final(found[-1]) and len(problem.lines_hz) < _MAX_LINES:
-        line_hz = strongest_line_at_hz(found[-1].problem, found[-1].state.y)
+    latest = found = _run_strategies(problem, y, report, _MAX_EVALUATIONS)
+    while not _is_final(latest[-1]):
+        line_hz = next((hz for hz in map(_line_hz, reversed(latest)) if hz > 0.0), 0.0)
         if line_hz == 0.0:
             break
         problem = with_line(problem, y, line_hz)
-        found += _run_strategies(problem, y, report, _MAX_EVALUATIONS - _evaluations_of_all(found))
+        left = _MAX_EVALUATIONS - _evaluations_of_all(found)
+        latest = _run_strategies(problem, y, report, left)
+        found = [*found, *latest]
     best = min(found, key=lambda one: (one.noise_power <= HOPELESS_NOISE, one.chi2_per_dof))
     evaluations = _evaluations_of_all(found)
     is_lost = evaluations > _MAX_EVALUATIONS and not _is_final(best)
@@ -150,21 +152,22 @@ def _run_strategies(
         simplest = WITH_MISMATCH[0 if problem.crossing.lead.is_equalised else 1]
     budget = _Budget(max_evaluations, WORTH_COMPLETING_CHI2)
     found = [_refine_candidates(problem, y, simplest, report, budget)]
-    if not _has_ended(found[0]):
+    if not (_is_final(found[0]) or _line_hz(found[0]) > 0.0):
         strategies, used = _other_strategies(found[0])
         found[0] = found[0]._replace(evaluations=found[0].evaluations + used)
         found += _try_strategies(problem, y, strategies, found[0], report, max_evaluations)
     best = min(range(len(found)), key=lambda k: found[k].chi2_per_dof)
-    if found[best].chi2_per_dof <= NO_FIT_CHI2 and not _has_ended(found[-1]):
+    has_ended = _is_final(found[-1]) or any(_line_hz(one) > 0.0 for one in found)
+    if found[best].chi2_per_dof <= NO_FIT_CHI2 and not has_ended:
         found.append(complete_fit(found.pop(best)))
     return found
 
 
-def _has_ended(found: Optimum) -> bool:
-    """Return whether no other strategy is tried: this is final, or shows a line to remove first."""
-    if _is_final(found) or len(found.problem.lines_hz) == _MAX_LINES:
-        return _is_final(found)
-    return strongest_line_at_hz(found.problem, found.state.y) > 0.0
+def _line_hz(found: Optimum) -> float:
+    """Return the frequency in Hz of a line to remove before a repeated search, 0 without any."""
+    if len(found.problem.lines_hz) == _MAX_LINES:
+        return 0.0
+    return strongest_line_at_hz(found.problem, found.state.y)
 
 
 def _other_strategies(fit: Optimum) -> tuple[tuple[SearchStrategy, ...], int]:
@@ -191,10 +194,16 @@ def _try_strategies(
     report: Report,
     max_evaluations: int,
 ) -> list[Optimum]:
-    """Return the optima of the strategies after the first one, up to the first that is final."""
+    """Return the optima of the strategies after the first one, up to the first that is final.
+
+    A line ends them, too, but only where mismatch, which resembles one without, is modelled or not
+    to be tried any more.
+    """
     found: list[Optimum] = []
-    has_friction = first.stopped_by_friction
+    has_friction, has_line = first.stopped_by_friction, False
     for strategy in strategies:
+        if has_line and not strategy.models_mismatch:
+            break
         if has_friction and strategy.uses_suspension:
             continue
         budget = _budget_left(max_evaluations, [first, *found])
@@ -202,7 +211,10 @@ def _try_strategies(
             break
         found.append(_refine_candidates(problem, y, strategy, report, budget))
         has_friction = found[-1].stopped_by_friction
-        if _has_ended(found[-1]):
+        if _is_final(found[-1]):
+            break
+        has_line = has_line or _line_hz(found[-1]) > 0.0
+        if has_line and strategy.models_mismatch:
             break
     return found
 

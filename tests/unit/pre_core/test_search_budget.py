@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pre_core.crossing import fit, misfit, optimum, refinement, walk
+from pre_core.crossing import (
+    fit,
+    frequency_continuation,
+    misfit,
+    optimum,
+    posterior,
+    refinement,
+    walk,
+)
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.misfit import OffBridgeFit
 from pre_core.physics.tandem import NO_LEAD
@@ -168,6 +176,9 @@ def test_other_bridges_are_tried_until_two_sets_of_starts_fail(
         gains = (3.0, 2.0, 1.0, -1.0)
         return [SimpleNamespace(y=np.full(1, one), gain=one) for one in gains], 10
 
+    where = SimpleNamespace(bridge=np.arange(1), trajectory=slice(0, 1))
+    monkeypatch.setattr(frequency_continuation, "layout", lambda _: where)
+    monkeypatch.setattr(posterior, "layout", lambda _: where)
     monkeypatch.setattr(refinement, "other_bridges", others)
     monkeypatch.setattr(refinement, "_is_sharp", lambda _: True)
     monkeypatch.setattr(refinement, "complete_fit", lambda one: one)
@@ -177,8 +188,8 @@ def test_other_bridges_are_tried_until_two_sets_of_starts_fail(
     assert best.chi2_per_dof == 3.0
     assert sets == [True, False, True]
     assert evaluations == 3 * 10 + 6
-    # Rivals of the last optimum are those of the two sets that failed.
-    assert [one[0] for one in best.rivals] == [3.0, 3.0, 2.0, 2.0]
+    # Rivals of the last optimum are those of the two sets that failed, each once.
+    assert [one[0] for one in best.rivals] == [3.0, 2.0, 1.0, -1.0]
 
 
 @pytest.mark.parametrize(
@@ -291,6 +302,40 @@ def test_clear_friction_and_mismatch_need_no_fit_off_the_bridge(
     monkeypatch.setattr(optimum, "fit_off_bridge", no_fit)
     strategies, used = optimum._other_strategies(found(5.0, 1)._replace(**{clear: True}))
     assert (len(strategies), used) == (4, 0)
+
+
+@pytest.mark.parametrize(
+    ("chi2", "lines", "tried"),
+    [
+        # Mismatch explains the line that a search without it ends with.
+        ((4.0, 1.0), (True,), 2),
+        # It does not: hum.
+        ((4.0, 4.0), (True,), 2),
+        ((4.0, 4.0), (False, True), 2),
+        ((4.0, 4.0, 4.0, 4.0), (False, False, False, False), 4),
+    ],
+)
+def test_a_line_ends_the_strategies_only_after_mismatch_was_tried(
+    chi2: tuple[float, ...],
+    lines: tuple[bool, ...],
+    tried: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    reached, shown = iter(chi2), iter(lines)
+    full_weight, reduced_weight = optimum._WITHOUT_MISMATCH
+    monkeypatch.setattr(optimum, "is_accepted", lambda _, value: value < 1.5)
+    monkeypatch.setattr(optimum, "strongest_line_at_hz", lambda *_: 25.0 * next(shown))
+    monkeypatch.setattr(optimum, "_refine_candidates", lambda *_: found(next(reached), 1))
+    ended = optimum._try_strategies(
+        SimpleNamespace(),  # type: ignore[arg-type]
+        np.zeros(1),
+        (reduced_weight, *optimum.WITH_MISMATCH, full_weight),
+        found(5.0, 1),
+        lambda *_: None,
+        1000,
+    )
+    assert len(ended) == tried
+    assert not list(shown)
 
 
 @pytest.mark.parametrize(("chi2", "ends_at"), [((9.0, 8.0), 1.0), ((11.0, 12.0), 11.0)])
