@@ -84,7 +84,8 @@ RUN python -c "import driveby.services.logger.run, driveby.services.cli.metrics"
     && rm -rf /tmp/kernels
 # The root file system is read-only and numba wants to write beside what it reads, so entrypoint.sh
 # copies these 8 MB to memory.
-RUN NUMBA_CACHE_DIR=/app/kernels /app/entrypoint.sh python -m driveby.services.execution.warm_up --strict
+RUN NUMBA_CACHE_DIR=/app/kernels /app/entrypoint.sh python -m driveby.services.execution.warm_up --strict \
+    && NUMBA_CACHE_DIR=/app/kernels /app/entrypoint.sh python -m driveby.services.simulation.warm_up --strict
 USER driveby
 
 FROM service AS view

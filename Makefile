@@ -29,8 +29,8 @@ $(PACKAGES): requirements/dev.txt pyproject.toml
 	@touch $@
 
 # numba inlines kernels of one file into another's and would not see that they have changed.
-$(STAMP): $(PACKAGES) $(wildcard pre_core/*.py pre_core/*/*.py)
-	@$(BIN)/python -m services.execution.warm_up || true
+$(STAMP): $(PACKAGES) $(wildcard pre_core/*.py pre_core/*/*.py services/simulation/two_sided*.py)
+	@$(BIN)/python -m services.simulation.warm_up & $(BIN)/python -m services.execution.warm_up; wait
 	@touch $@
 
 demo: $(STAMP) ## a truck crosses a bridge: simulated, recorded, identified, drawn

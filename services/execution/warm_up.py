@@ -11,6 +11,7 @@ The image of the containers is built with `--strict`.
 
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -20,8 +21,8 @@ from pre_core import parameters
 from pre_core.crossing import posterior
 from pre_core.crossing.compliances import draws, from_normal
 from pre_core.crossing.preparation import CrossingInputs, build_problem
+from pre_core.crossing.whitening import solve_transposed
 from pre_core.paper import experiment, least_squares, random_walk, residual
-from pre_core.paper.crossing import paper_window
 from pre_core.paper.integrate import spline_integrate
 from pre_core.paper.window import MeasuredCrossing, build_window
 from pre_core.physics.models import from_models
@@ -34,24 +35,32 @@ _SOUND = experiment.beam(np.ones(experiment.ELEMENTS))
 
 
 def main(*, strict: bool = False) -> int:
-    """Compile missing kernels, print begin and end; return 0, or 1 on failure if `strict`.
+    """Compile missing kernels of identifications, and print begin and end.
 
-    An image is built with `strict`: otherwise every start of a container would compile again.
+    Return 0, or 1 on failure if `strict`. An image is built with `strict`: otherwise every start of
+    a container would compile again.
     """
-    began = time.perf_counter()
-    try:
+
+    def compile_all() -> None:
         _remove_stale(PACKAGE)
         if not any(PACKAGE.rglob("__pycache__/*.nbi")):
             sys.stdout.write("compiling kernels, about a minute, once\n")
             sys.stdout.flush()
         warm_up()
-        _warm_up_validation()
+
+    return report_on(compile_all, "kernels", strict=strict)
+
+
+def report_on(compile_all: Callable[[], None], what: str, *, strict: bool = False) -> int:
+    """Compile kernels and print how long it took; return 0, or 1 on failure if `strict`."""
+    began = time.perf_counter()
+    try:
+        compile_all()
     except Exception as error:  # noqa: BLE001, RUF100 - see the module's docstring
-        what = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        sys.stdout.write(f"kernels not compiled, the first command will do it ({what})\n")
+        why = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        sys.stdout.write(f"{what} not compiled, the first command will do it ({why})\n")
         return int(strict)
-    else:
-        sys.stdout.write(f"kernels compiled ({time.perf_counter() - began:.0f} s)\n")
+    sys.stdout.write(f"{what} compiled ({time.perf_counter() - began:.0f} s)\n")
     return 0
 
 
@@ -66,12 +75,16 @@ def warm_up() -> None:
 
 
 def _warm_up_fusing() -> None:
-    """Run the sampler of a bridge of one element, without supports that might be absent."""
+    """Run the kernels of a fusion.
+
+    The sampler's bridge has one element, and no supports that might be absent.
+    """
     one, nowhere = np.ones(1), np.zeros(0, dtype=np.int64)
     density = from_normal(
         np.eye(2), np.ones(2), np.ones(1, dtype=np.int64), nowhere, one, np.zeros(2), one
     )
     draws(density, 1, 0, 0)
+    solve_transposed(np.ones((1, 1)), one, one.copy())
 
 
 def _warm_up_pre() -> None:
@@ -147,11 +160,6 @@ def _warm_up_paper() -> None:
     residual.objective(window, work, theta)
     walk = random_walk.problem(window, theta, free, 0, threads=1)
     random_walk.step(walk, random_walk.init(walk, particles=1))
-
-
-def _warm_up_validation() -> None:
-    """Run the remaining kernels of a simulation and a reproduction of the paper."""
-    paper_window(experiment.TRUCK, _SOUND, 0.0, 0)
 
 
 def _remove_stale(package: Path) -> None:

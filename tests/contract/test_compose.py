@@ -161,8 +161,9 @@ def test_the_image_is_built_of_what_is_pinned_by_hash() -> None:
 
 
 def test_the_image_compiles_its_kernels_where_the_entrypoint_looks() -> None:
-    step = "python -m driveby.services.execution.warm_up --strict"
-    assert f"RUN NUMBA_CACHE_DIR=/app/kernels /app/entrypoint.sh {step}" in DOCKERFILE
+    for room in ("execution", "simulation"):
+        step = f"python -m driveby.services.{room}.warm_up --strict"
+        assert f" NUMBA_CACHE_DIR=/app/kernels /app/entrypoint.sh {step}" in DOCKERFILE
     entrypoint = (ROOT / "entrypoint.sh").read_text()
     assert "${KERNELS:-/app/kernels}" in entrypoint
     cache = re.search(r"NUMBA_CACHE_DIR=(/tmp/\S+)", DOCKERFILE)
