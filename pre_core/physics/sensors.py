@@ -9,6 +9,7 @@ one-sided amplitude density d in ug/sqrt(Hz) with a corner frequency f_c: its po
 so that white noise at the output rate f_s has the standard deviation d sqrt(f_s/2).
 """
 
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -178,9 +179,9 @@ def gauss_markov(
     phi = float(np.exp(-(time_s[1] - time_s[0]) / correlation_s))
     innovations = np.sqrt(1.0 - phi**2) * draws
     innovations[0] = draws[0]
-    from scipy.signal import lfilter  # slow to import, seldom needed
-
-    return np.asarray(lfilter([1.0], [1.0, -phi], innovations))
+    # scipy.signal has this filter, too, and takes longer to import than a drive to simulate.
+    values = accumulate(innovations.tolist(), lambda last, new: phi * last + new)
+    return np.fromiter(values, dtype=np.float64, count=innovations.size)
 
 
 def measure_position(
