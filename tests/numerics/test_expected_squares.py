@@ -49,7 +49,7 @@ def test_sensor_noise_of_far_trucks_against_dense_covariances() -> None:
     It is the sum of squares of L_0^-1 L.
     """
     found = at_its_truth()
-    problem, y = without_mismatch(found), far_trucks(found, 4)
+    problem, y = without_mismatch(found), far_trucks(found, 2)
     of = expected_squares(problem, found.state.y)
     seen = of.beyond_tangent(y) + (y - of.y) @ of.tangent
     here = dense_factor(problem.noise)

@@ -130,10 +130,9 @@ def check_on_two_roads(found: Judged) -> None:
     assert evaluations < MAX_EVALUATIONS
 
 
-RUNS_OF_D8 = [pytest.param(run, marks=() if run == 3 else pytest.mark.slow) for run in range(12)]
 
-
-@pytest.mark.parametrize("run", RUNS_OF_D8)
+@pytest.mark.slow
+@pytest.mark.parametrize("run", range(12))
 def test_a_road_that_differs_from_axle_to_axle(shared: Path, run: int) -> None:
     found = judged(shared / "crossings" / "d8_real_road_12_runs", run)
     assert found.result.verdict == "good", found.result.reasons

@@ -188,13 +188,13 @@ def counted_records(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_what_unpacks_to_gigabytes_is_not_gone_through(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, filling: bytes
 ) -> None:
-    """200 KB that decompress to 6 GB, of zeros or of records without content."""
+    """60 KB that decompress to 2 GB, of zeros or of records without content."""
     one = chunk(filling * (mcap_scan.MAX_RECORD_BYTES // 9))
     path = tmp_path / "bomb.mcap"
-    path.write_bytes(MCAP0_MAGIC + one * 100)
+    path.write_bytes(MCAP0_MAGIC + one * 30)
     seen = counted_records(monkeypatch)
     info = read_info(path)
-    assert seen[0] < 3_000_000
+    assert seen[0] < 900_000
     assert info.truncated
     assert info.damaged_chunks >= 1
     with pytest.raises(InputError, match="holds nothing of an MCAP recording"):
