@@ -130,7 +130,6 @@ def check_on_two_roads(found: Judged) -> None:
     assert evaluations < MAX_EVALUATIONS
 
 
-
 @pytest.mark.slow
 @pytest.mark.parametrize("run", range(12))
 def test_a_road_that_differs_from_axle_to_axle(shared: Path, run: int) -> None:
