@@ -21,7 +21,7 @@ from services.common.files import check_writable, make_folder
 from services.common.language import ENGLISH
 from services.common.naming import count_of, processes_in_words
 from services.common.progress import progress_bar, start_line
-from services.common.truck_choice import truck_to_try
+from services.common.truck_choice import TRUCK_CHOICES, truck_to_try
 from services.history.validation_files import save
 from services.simulation.validation_options import CertificateOptions
 from services.simulation.validation_trial import (
@@ -81,10 +81,10 @@ def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
             certificate = trial.certificate(time.time())
             path = save(asked.validations, certificate)
             if not certificate.passed:
-                failed.add(truck_to_try(known.vehicle(pair.vehicle)))
+                failed.add(truck_to_try(known.vehicle(pair.vehicle), known.bridge(pair.bridge)))
             console.print(line_of(certificate, path, known), highlight=False, soft_wrap=True)
     if failed:
-        kind = next(one for one in ("unlike", "single", "tandem") if one in failed)
+        kind = min(failed, key=TRUCK_CHOICES.index)
         remedy = ENGLISH.text(f"caution.try.{kind}")
         console.print(_AFTER_FAILURE.format(remedy=remedy), highlight=False, soft_wrap=True)
     return int(bool(failed))

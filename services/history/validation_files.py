@@ -89,6 +89,7 @@ def validation_notes(
             untried.append(pair.vehicle)
         elif not record.passed:
             figures = record.figures
+            kind = truck_to_try(site.vehicle(pair.vehicle), site.bridge(pair.bridge))
             yield language.text(
                 "caution.validation_failed",
                 truck=pair.vehicle,
@@ -97,7 +98,7 @@ def validation_notes(
                 covered=figures.covered,
                 intervals=figures.intervals,
                 least=100.0 * LEAST_COVERAGE,
-                remedy=language.text(f"caution.try.{truck_to_try(site.vehicle(pair.vehicle))}"),
+                remedy=language.text(f"caution.try.{kind}"),
             )
     if untried:
         trucks = language.listed(untried)

@@ -6,6 +6,7 @@ from typing import Final
 
 from pre_core.survey.detection import DETECTION_PROBABILITY
 from services.common.naming import count_of
+from services.common.truck_choice import truck_to_try
 from services.identification.checks import SHORTEST_APPROACH_M
 from services.identification.identify import SLOWEST_M_PER_S
 from services.inspection.finding import CheckStatus
@@ -15,7 +16,7 @@ from services.inspection.site import (
     noise_declared,
     sampling,
 )
-from services.planning.alternatives import EQUAL_TYRES
+from services.planning.alternatives import EQUAL_TYRES, TANDEM
 from services.planning.crossings import axles_of, has_declared_offset
 from services.planning.survey import MAX_CROSSINGS, PlanForecast, SurveyForecast
 
@@ -99,13 +100,23 @@ def _of_the_others(found: SurveyForecast) -> str:
         and (has_tandem or one.plan.site.vehicles[0].tandem is None)
     ]
     better = sorted((one for one in same if _helps(one, planned)), key=_rank)
+    tandem = f"{TANDEM}, by less than its row states." if _is_tandem_advised(found) else ""
     if not better:
-        return "No other change of truck, load, direction or sensors helps much."
+        other = "No other change of truck, load, direction or sensors helps much."
+        return f"What helps is {tandem}" if tandem else other
     best, *rest = better
     sentence = f"What helps most: {_change(best)}; then {_gain(best, found)}."
     if rest:
         sentence += f" Next best: {_change(rest[0])} (then {_gain(rest[0], found)})."
-    return sentence
+    return f"{sentence} So does {tandem}" if tandem else sentence
+
+
+def _is_tandem_advised(found: SurveyForecast) -> bool:
+    """Return whether reports would advise a truck with a tandem, and its row is better."""
+    site = found.planned.plan.site
+    rows = [one for one in found.others if one.plan.name == TANDEM]
+    is_better = any(_helps(row, found.planned) for row in rows)
+    return is_better and truck_to_try(site.vehicles[0], site.bridges[0]) == "tandem"
 
 
 def _gain(one: PlanForecast, found: SurveyForecast) -> str:

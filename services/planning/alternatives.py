@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 from schemas.site import Bridge, Site, Vehicle
 from schemas.site_axle_tables import TYRES
 from schemas.site_vehicle import axle_loads_kg
+from services.common.truck_choice import allows_tandem
 from services.identification.checks import loads_are_alike
 from services.planning.crossings import PlannedCrossing, axles_of
 from services.simulation.usual_trucks import usual_lorry, usual_tandem
@@ -25,6 +26,7 @@ _MOVED: Final = 0.12
 _UNEQUAL: Final = ("tyre_contact_length_m", "track_m")
 """Pairs of a site file that equal single tyres have in common, besides the width."""
 EQUAL_TYRES: Final = "equal single tyres on both axles"
+TANDEM: Final = "a truck with an equalised tandem"
 _OTHER_WAY = "half of the runs the other way"
 
 
@@ -103,8 +105,8 @@ def _other_trucks(site: Site) -> Iterator[tuple[str, Site]]:
         return
     if not is_equal or front.twin_distance_m > 0.0:
         yield EQUAL_TYRES, with_tyres(site, "single")
-    if not bridge.interior_supports_m and len(set(bridge.lengths_m)) == 1:
-        yield "a truck with an equalised tandem", _with_vehicle(site, usual_tandem(noise))
+    if allows_tandem(bridge):
+        yield TANDEM, _with_vehicle(site, usual_tandem(noise))
 
 
 def with_tyres(site: Site, behind: str) -> Site:

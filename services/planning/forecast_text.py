@@ -115,7 +115,7 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
 def _not_advised(found: SurveyForecast) -> Iterator[str]:
     """Yield which rows the advice leaves out, and why."""
     if found.planned.plan.site.vehicles[0].tandem is None:
-        yield "the advice leaves out tandems, whose forecast is too optimistic, and"
+        yield "the advice does not rank tandems, whose forecast is too optimistic, nor"
         yield "fewer elements, as a loss in one of them is more damage"
     else:
         yield "the advice leaves out fewer elements, as a loss in one is more damage"

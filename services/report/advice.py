@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from schemas.results import CrossingResult
 from services.common.language import Language, utc_day
-from services.common.truck_choice import truck_to_try
+from services.common.truck_choice import TRUCK_CHOICES, truck_to_try
 from services.report.bridge import BridgeReport, still_weak
 from services.report.cautions import named_elements, possibly_weak, weak_before
 from services.report.place import position_of
@@ -56,10 +56,11 @@ def next_steps(report: BridgeReport, language: Language) -> Iterator[str]:
 
 
 def _other_truck(report: BridgeReport, language: Language) -> Iterator[str]:
-    """Yield which truck would help; other tyres help only a truck with single and twin ones."""
+    """Yield which truck would help, given the best one of those used."""
     known = {one.id: one for one in report.site.vehicles}
-    kinds = {truck_to_try(known[one.vehicle]) for one in report.used if one.vehicle in known}
-    best = next((kind for kind in ("tandem", "single") if kind in kinds), "truck")
+    trucks = [known[one.vehicle] for one in report.used if one.vehicle in known]
+    choices = [truck_to_try(truck, report.bridge) for truck in trucks]
+    best = max(choices, key=TRUCK_CHOICES.index, default="single")
     yield language.text(f"advice.open_{best}")
 
 

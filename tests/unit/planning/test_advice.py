@@ -6,12 +6,16 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 
+from schemas.site import Site
+from services.common.language import ENGLISH
+from services.common.truck_choice import truck_to_try
 from services.planning.advice import advice
-from services.planning.alternatives import as_planned, with_noise
+from services.planning.alternatives import TANDEM, as_planned, with_noise
 from services.planning.crossings import PlannedRoad
 from services.planning.forecast_text import lines_of
 from services.planning.survey import PlanForecast, SurveyExpectation, SurveyForecast, SurveyQuestion
 from services.simulation.drive import paper_site
+from services.simulation.usual_trucks import usual_tandem
 
 SITE = with_noise(paper_site(), (25.0,) * 4)
 NONE_HELPS = "No other change of truck, load, direction or sensors helps much."
@@ -19,21 +23,30 @@ Row = tuple[int | None, int | None, float]
 """Columns `needed`, `ends` and `smallest` of the table."""
 
 
-def forecast(planned: Row, crossings: int = 12, **others: Row) -> SurveyForecast:
-    plan = as_planned(SITE, 10.0)
+def forecast(
+    planned: Row,
+    crossings: int = 12,
+    site: Site = SITE,
+    tandem: Row | None = None,
+    **others: Row,
+) -> SurveyForecast:
+    plan = as_planned(site, 10.0)
+    of_tandem = as_planned(site.model_copy(update={"vehicles": (usual_tandem(25.0),)}), 10.0)
 
     def row(name: str, values: Row) -> PlanForecast:
         middle, ends, smallest = values
         wide = np.full(7, 0.2)
         expected = SurveyExpectation(crossings, wide, 0.1, wide, wide, np.full(7, smallest))
-        return PlanForecast(plan._replace(name=name), expected, expected, 3, middle, ends)
+        of = of_tandem if name == TANDEM else plan
+        return PlanForecast(of._replace(name=name), expected, expected, 3, middle, ends)
 
+    rows = others if tandem is None else {**others, TANDEM: tandem}
     outlook = row("as planned", planned)
     return SurveyForecast(
         SurveyQuestion(0.2, crossings, 10.0, (10.0, 10.0)),
         PlannedRoad("A", 0.12),
         outlook,
-        tuple(row(name, values) for name, values in others.items()),
+        tuple(row(name, values) for name, values in rows.items()),
         (),
         None,
         (outlook.expected,),
@@ -115,7 +128,31 @@ def key(row: Row) -> tuple[float, float, float]:
 
 def test_table_names_the_rows_without_advice() -> None:
     text = " ".join(lines_of(forecast((9, 40, 0.2))))
-    assert "the advice leaves out tandems, whose forecast is too optimistic, and fewer el" in text
+    assert "the advice does not rank tandems, whose forecast is too optimistic, nor fewer" in text
+
+
+@pytest.mark.parametrize("twin_m", [0.33, 0.0])
+@pytest.mark.parametrize("supports_m", [(), (15.0,)])
+def test_survey_and_report_advise_a_tandem_for_the_same_trucks(
+    twin_m: float, supports_m: tuple[float, ...]
+) -> None:
+    """Each truck on each bridge; the row of the table is optimistic, and better than the plan."""
+    bridge = SITE.bridges[0].model_copy(
+        update={"interior_supports_m": supports_m, "elements": 6, "element_lengths_m": None}
+    )
+    truck = SITE.vehicles[0].model_copy(update={"twin_tyre_distance_m": (0.0, twin_m)})
+    site = SITE.model_copy(update={"vehicles": (truck,), "bridges": (bridge,)})
+    found = forecast((None, None, 0.5), site=site, tandem=(6, 43, 0.17))
+    is_advised = f"What helps is {TANDEM}, by less" in advice(found)
+    words = ENGLISH.text(f"advice.open_{truck_to_try(truck, bridge)}")
+    assert is_advised == ("equalised tandem" in words)
+    assert is_advised == (twin_m > 0.0 and not supports_m)
+
+
+def test_tandem_that_does_not_help_is_not_advised() -> None:
+    assert NONE_HELPS in advice(forecast((9, 40, 0.2), tandem=(9, 40, 0.19)))
+    better = forecast((None, None, 0.5), few=(20, None, 0.3), tandem=(6, 43, 0.17))
+    assert advice(better).endswith(f"So does {TANDEM}, by less than its row states.")
 
 
 def test_legend_says_why_equal_deviations_are_seen_unequally() -> None:

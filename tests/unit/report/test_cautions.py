@@ -345,7 +345,7 @@ def test_missing_or_failed_site_validation_is_named_once(
     text = cautions_with(found)
     assert untried not in text
     figures = {"good": 1, "crossings": 1, "covered": 2, "intervals": 2, "least": 85.0}
-    values = {"truck": "truck-1", "remedy": words.text("caution.try.unlike")} | figures
+    values = {"truck": "truck-1", "remedy": words.text("caution.try.tandem")} | figures
     assert text.startswith(words.text("caution.validation_failed", **values))
     named = [one | {"certificate": failed.hash} for one in two]
     assert "driveby validate" not in cautions_with(results_of(site, *named, used="b"))
