@@ -190,6 +190,11 @@ def is_from_recording(realm: str) -> bool:
     return realm.startswith(("replay-", "import-"))
 
 
+def is_simulated(realm: str) -> bool:
+    """Return whether a realm's messages come from a simulation."""
+    return realm.startswith("sim-")
+
+
 def key(realm: str, owner: str, identifier: str, stream: str) -> str:
     """Return the Zenoh key; raise ValueError if a part is malformed or the topic does not exist."""
     topic(owner, stream)

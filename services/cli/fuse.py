@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from schemas.results import BridgeResult, Results, load_results, results_json
 from schemas.site_file import load_site
 from services.cli.bridge_table import print_bridge
-from services.cli.identify import print_validation, warn_of_shared_crossings
+from services.cli.identify import print_validation, warn_of_baselines
 from services.cli.settings import FuseOptions
 from services.common.errors import InputError
 from services.common.files import check_writable, write_atomically
@@ -19,7 +19,8 @@ from services.history.validation_files import (
     pairs_with_intervals,
     pairs_without_validation,
 )
-from services.ledger.baselines import baselines_of
+from services.identification.comparison import RealmsOfBridges
+from services.ledger.baselines import baselines_of, realms_of_baselines, realms_of_bridges
 from services.ledger.site_of_results import site_of_results
 
 if TYPE_CHECKING:
@@ -49,7 +50,11 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
     stored = _baselines(baseline, asked.site)
     with parts_bar("fusing bridge", len(found.by_bridge), console) as report:
         fused = fuse_crossings(
-            str(paths[0]), found, stored, report, fuse_suspect=asked.fuse_suspect
+            str(paths[0]),
+            found,
+            None if stored is None else (stored.name, stored.bridges),
+            report,
+            fuse_suspect=asked.fuse_suspect,
         )
     for name, number in fused.unfused.items():
         console.print(f"{name}: none of {number} crossings can be fused", highlight=False)
@@ -60,22 +65,32 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
     newest, _ = max(zip(paths, files, strict=True), key=lambda one: one[1].created)
     _print_validations(console, newest, fused.results, asked)
     if stored is not None:
-        warn_of_shared_crossings(fused.results.bridges, stored[1])
+        now = realms_of_bridges(found.crossings)
+        warn_of_baselines(fused.results.bridges, stored.bridges, now, stored.realms)
     if json_path is not None:
         write_atomically(json_path, results_json(fused.results))
     return 0
 
 
-def _baselines(
-    given: Path | None, site: Path | None
-) -> tuple[str, Mapping[str, BridgeResult]] | None:
-    """Return the states to compare with, and their file: as given, else as the site file names."""
+class _Baselines(NamedTuple):
+    """States to compare with, by bridge, and the name of their file."""
+
+    name: str
+    bridges: Mapping[str, BridgeResult]
+    realms: RealmsOfBridges
+
+
+def _baselines(given: Path | None, site: Path | None) -> _Baselines | None:
+    """Return the states to compare with: as given, else as the site file names."""
     if given is not None:
-        return str(given), load_results(given).bridges
+        before = load_results(given)
+        return _Baselines(str(given), before.bridges, realms_of_bridges(before.crossings))
     if site is None:
         return None
-    named = baselines_of(load_site(site), site.parent)
-    return (str(site), named) if named else None
+    known = load_site(site)
+    named = baselines_of(known, site.parent)
+    realms = realms_of_baselines(known, site.parent)
+    return _Baselines(str(site), named, realms) if named else None
 
 
 def _print_validations(

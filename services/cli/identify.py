@@ -54,9 +54,9 @@ from services.history.validation_files import (
     passed_validations,
 )
 from services.identification.bridge_state import FusionSettings
-from services.identification.comparison import baseline_cautions
+from services.identification.comparison import RealmsOfBridges, baseline_cautions
 from services.identification.methods import lacks_noise
-from services.ledger.baselines import baselines_of
+from services.ledger.baselines import baselines_of, realms_of_baselines, realms_of_bridges
 from services.recordings.recording import read_messages
 from services.recordings.remote import Source, all_fetched, is_folder_of_recordings
 
@@ -88,7 +88,12 @@ def identify_command(
         found = _found(request, draws, executing, console)
         _print(console, found, known)
         print_validation(console, found, known, validations_folder(asked.validations))
-        warn_of_shared_crossings(found.bridges, request.fusing.baselines)
+        warn_of_baselines(
+            found.bridges,
+            request.fusing.baselines,
+            realms_of_bridges(found.crossings),
+            request.baseline_realms,
+        )
         if asked.json is not None:
             write_atomically(asked.json, results_json(found))
         if asked.rrd is not None:
@@ -151,6 +156,7 @@ class _IdentifyRequest(NamedTuple):
     settings: IdentificationSettings
     fusing: FusionSettings
     certificates: Mapping[VehicleBridgePair, str]
+    baseline_realms: RealmsOfBridges
 
 
 def _request(asked: IdentifyOptions, files: list[Path]) -> _IdentifyRequest:
@@ -161,7 +167,8 @@ def _request(asked: IdentifyOptions, files: list[Path]) -> _IdentifyRequest:
     settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
     warn_of_no_noise(site, method)
     records = passed_validations(validations_folder(asked.validations), site, settings)
-    return _IdentifyRequest(files, site, settings, fusing, records)
+    realms = realms_of_baselines(site, beside, asked.baseline)
+    return _IdentifyRequest(files, site, settings, fusing, records, realms)
 
 
 def _found(
@@ -201,11 +208,14 @@ def warn_of_no_noise(site: Site, method: str) -> None:
         )
 
 
-def warn_of_shared_crossings(
-    states: Mapping[str, BridgeResult], baselines: Mapping[str, BridgeResult]
+def warn_of_baselines(
+    states: Mapping[str, BridgeResult],
+    baselines: Mapping[str, BridgeResult],
+    now: RealmsOfBridges,
+    then: RealmsOfBridges,
 ) -> None:
-    """Warn where a bridge is compared with a baseline of the same crossings."""
-    for line in baseline_cautions(states, baselines):
+    """Warn where a bridge is compared with a misleading baseline, as `baseline_cautions`."""
+    for line in baseline_cautions(states, baselines, now, then):
         _log.warning("%s", line)
 
 

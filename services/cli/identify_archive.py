@@ -16,8 +16,8 @@ from services.catalogue.positions import crossings_of
 from services.cli.bridge_table import print_bridge
 from services.cli.identify import (
     check_no_tables,
+    warn_of_baselines,
     warn_of_no_noise,
-    warn_of_shared_crossings,
 )
 from services.cli.parsing import EXIT_SOMETHING_LOST
 from services.cli.settings import IdentifyOptions
@@ -37,7 +37,7 @@ from services.history.validation_files import (
     passed_validations,
 )
 from services.identification.bridge_state import FusionSettings, with_common_shares
-from services.ledger.baselines import baselines_of
+from services.ledger.baselines import baselines_of, realms_of_baselines, realms_of_bridges
 from services.recordings.remote import (
     Recording,
     RemoteRecording,
@@ -70,26 +70,23 @@ def archive_command(
     _check(options, into)
     problems: list[str] = []
     known = _site_of(options.recordings, site)
+    beside = None if site is None else site.parent
     recordings = _recordings(options.recordings, known, problems)
     settings = IdentificationSettings.model_validate(
         {"method": options.search_method, "seed": options.seed}
     )
     warn_of_no_noise(known, options.search_method)
-    asked = ArchiveJob(
-        tuple(recordings),
-        known,
-        settings,
-        FusionSettings(
-            baselines_of(known, None if site is None else site.parent, options.baseline),
-            options.fuse_suspect,
-        ),
-        passed_validations(folder, known, settings),
-    )
+    fusing = FusionSettings(baselines_of(known, beside, options.baseline), options.fuse_suspect)
+    validated = passed_validations(folder, known, settings)
+    asked = ArchiveJob(tuple(recordings), known, settings, fusing, validated)
     crossings: list[CrossingResult] = []
     pairs = ValidatedPairs()
+    realms: dict[str, set[str]] = {}
 
     def take(crossing: CrossingResult) -> None:
         pairs.add(crossing)
+        for bridge, of_bridge in realms_of_bridges([crossing]).items():
+            realms.setdefault(bridge, set()).update(of_bridge)
         if json_path is not None:
             crossings.append(crossing)
 
@@ -102,7 +99,8 @@ def archive_command(
             on_result=take,
             report=lambda number: bar.update(task, description=count_of(number, "crossing")),
         )
-    warn_of_shared_crossings(found.bridges, asked.fusing.baselines)
+    of_baselines = realms_of_baselines(known, beside, options.baseline)
+    warn_of_baselines(found.bridges, asked.fusing.baselines, realms, of_baselines)
     header = asked.header
     _write(into / BRIDGES, header, [], found)
     if json_path is not None:

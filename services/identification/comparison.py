@@ -14,6 +14,7 @@ import numpy as np
 
 from pre_core.constants import NORMAL_975
 from schemas.results import RESOLVED, BridgeResult, ElementState, Parameter
+from schemas.topics import is_simulated
 from services.common.arrays import Floats
 from services.common.language import ENGLISH, Language
 from services.common.naming import entry_in_name
@@ -25,6 +26,8 @@ IMPLAUSIBLE_GAIN = 0.2
 30 K, the stiffness of concrete and asphalt rises by some 12 %."""
 Stated = Literal["unresolved", "visible"]
 """A sentence that may be left out: on unresolved elements, on the smallest visible loss."""
+RealmsOfBridges = Mapping[str, Collection[str]]
+"""Realms of crossings, by bridge."""
 _FEWEST_ELEMENTS = 3
 """Fewest comparable elements: of two, the undamaged one cannot be identified."""
 
@@ -54,14 +57,38 @@ def doubts_of_baseline(
         yield language.text("caution.baseline_later", then=then, now=now)
 
 
+def origin_caution(
+    now: Iterable[str], then: Iterable[str], language: Language = ENGLISH
+) -> str | None:
+    """Return a caution if only one of a measurement and its baseline was simulated; else None.
+
+    `now` and `then` are the realms of their crossings.
+    """
+    kinds = [{is_simulated(realm) for realm in realms} for realms in (now, then)]
+    if not all(kinds) or kinds[0] == kinds[1]:
+        return None
+    which = "baseline" if True in kinds[1] else "crossings"
+    return language.text(f"caution.simulated_{which}")
+
+
 def baseline_cautions(
-    states: Mapping[str, BridgeResult], baselines: Mapping[str, BridgeResult]
+    states: Mapping[str, BridgeResult],
+    baselines: Mapping[str, BridgeResult],
+    now: RealmsOfBridges,
+    then: RealmsOfBridges,
 ) -> Iterator[str]:
-    """Yield a line for each bridge that is compared with crossings of its own, by its name."""
+    """Yield a line for each bridge that is compared with another kind, or with its own crossings.
+
+    `now` and `then` are the realms of the crossings and of those of the baselines.
+    """
     for name, state in states.items():
-        if name in baselines:
-            before = frozenset(baselines[name].crossings_used)
-            caution = shared_crossings(frozenset(state.crossings_used), before)
+        if name not in baselines:
+            continue
+        used, before = (frozenset(one.crossings_used) for one in (state, baselines[name]))
+        for caution in (
+            origin_caution(now.get(name, ()), then.get(name, ())),
+            shared_crossings(used, before),
+        ):
             if caution is not None:
                 yield f"{name}: {caution}"
 

@@ -1,9 +1,10 @@
 """Stored states of bridges, with which new ones are compared."""
 
 import logging
+from collections.abc import Iterable
 from pathlib import Path
 
-from schemas.results import BridgeResult, load_results
+from schemas.results import BridgeResult, CrossingResult, load_results
 from schemas.site import Bridge, Site
 from services.common.errors import InputError
 from services.common.outputs import add_input
@@ -37,6 +38,33 @@ def baselines_of(
             _log.warning("the baseline %s of %s is missing; see --baseline", path, bridge.id)
             continue
         out[bridge.id] = stored_state(path, bridge)
+    return out
+
+
+def realms_of_bridges(crossings: Iterable[CrossingResult]) -> dict[str, set[str]]:
+    """Return the realms of the crossings with an estimate, by bridge."""
+    found: dict[str, set[str]] = {}
+    for one in crossings:
+        if one.parameters is not None:
+            found.setdefault(one.bridge, set()).add(one.realm)
+    return found
+
+
+def realms_of_baselines(
+    site: Site | None, beside: Path | None, given: Path | None = None
+) -> dict[str, set[str]]:
+    """Return the realms of the crossings in the baselines, by bridge; chosen as in `baselines_of`.
+
+    Crossings that a file of states alone does not contain have no realm.
+    """
+    if given is not None:
+        return realms_of_bridges(load_results(given).crossings)
+    out = {}
+    for bridge in () if site is None else site.bridges:
+        path = None if bridge.baseline is None else (beside or Path()) / bridge.baseline
+        if path is not None and path.is_file():
+            realms = realms_of_bridges(load_results(path).crossings)
+            out[bridge.id] = realms.get(bridge.id, set())
     return out
 
 

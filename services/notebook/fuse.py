@@ -19,6 +19,7 @@ from services.common.kinds import RESULTS
 from services.execution.blas import one_blas_thread
 from services.execution.fuse_results import FusedElements, crossings_to_fuse, fuse_crossings
 from services.identification.comparison import baseline_cautions
+from services.ledger.baselines import realms_of_bridges
 from services.notebook.arguments import file_of, known_arguments, path_of
 from services.notebook.read import Name, given_site
 from services.notebook.showing import RIGIDITY_HEAD, html_table, rigidity_cells
@@ -158,7 +159,8 @@ def fuse(
             fuse_suspect=fuse_suspect,
         )
     if stored is not None:
-        for line in baseline_cautions(fused.results.bridges, stored.bridges):
+        now, then = (realms_of_bridges(one.crossings) for one in (found, stored))
+        for line in baseline_cautions(fused.results.bridges, stored.bridges, now, then):
             warnings.warn(line, stacklevel=3)
     known = _newest_site(given) if site is None else given_site(site)
     return Fusion(fused.results, fused.bridges, known, stored)

@@ -19,6 +19,7 @@ from services.identification.comparison import (
     compare,
     describe_weak_before,
     doubts_of_baseline,
+    origin_caution,
     shared_crossings,
 )
 from services.identification.comparison import weak_before as of_baseline
@@ -53,6 +54,7 @@ def cautions(measured: CautionBasis, language: Language) -> Iterator[str]:
     """Yield the cautions on a finding, the most important one first."""
     if measured.view.estimate is None:
         return
+    yield from _origin(measured, language)
     yield from measured.validation
     yield from _of_baseline(measured, language)
     comparison = measured.view.comparison
@@ -91,6 +93,15 @@ def named_elements(numbers: Sequence[int], language: Language) -> str:
     """Return `element 3` or `elements 3 and 5`."""
     which = "caution.element" if len(numbers) == 1 else "caution.elements"
     return language.text(which, elements=language.listed([str(number) for number in numbers]))
+
+
+def _origin(measured: CautionBasis, language: Language) -> Iterator[str]:
+    """Yield that only one of the measurement and its baseline was simulated."""
+    before = () if measured.before is None else measured.before.crossings
+    now, then = ({one.realm for one in some} for some in (measured.crossings, before))
+    caution = origin_caution(now, then, language)
+    if caution is not None:
+        yield caution
 
 
 def _of_baseline(measured: CautionBasis, language: Language) -> Iterator[str]:

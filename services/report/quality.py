@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from schemas.results import BridgeResult, CrossingResult
+from schemas.topics import is_simulated
 from services.common.language import Language
 from services.identification.comparison import Estimate
 from services.viewer.bridge_view import BridgeView
@@ -30,7 +31,7 @@ def quality(view: BridgeView, crossings: Sequence[CrossingResult], language: Lan
         number = sum(one.realm in campaigns for one in crossings)
         realms = ", ".join(campaigns)
         parts.append(language.choice("quality.other_realm", number, realms=realms))
-    if all(one.realm.startswith("sim-") for one in crossings):
+    if all(is_simulated(one.realm) for one in crossings):
         parts.append(language.choice("quality.simulated", len(crossings)))
     if view.estimate is None:
         return " ".join((*parts, language.text("quality.none")))

@@ -31,11 +31,12 @@ from services.execution.offline import header_of
 from services.execution.processes import ProcessExecutor
 from services.history.validation_files import passed_validations
 from services.identification.bridge_state import FusionSettings
+from services.identification.comparison import origin_caution
 from services.identification.engine import Engine
 from services.identification.known import search_hash
 from services.identification.methods import METHODS
 from services.identification.waiting import Validations
-from services.ledger.baselines import baselines_of
+from services.ledger.baselines import baselines_of, realms_of_baselines
 from services.ledger.crossing_log import Ledger
 from services.ledger.cut_off_results import recover_cut_off_results
 from services.ledger.runs import (
@@ -170,6 +171,10 @@ def _search(asked: WorkerSettings) -> Search:
     settings = IdentificationSettings.model_validate({"method": asked.search_method})
     header = header_of(site, settings, time.time())
     fusing = FusionSettings(baselines_of(site, asked.site.parent), threads=settings.threads)
+    for name, realms in realms_of_baselines(site, asked.site.parent).items():
+        caution = origin_caution([asked.realm], realms)
+        if caution is not None:
+            _log.warning("%s: %s", name, caution)
     certificates = asked.certificates or asked.folder / "certificates"
     return Search(asked.site, text, site, settings, header, fusing, certificates)
 

@@ -94,8 +94,9 @@ def _report(asked: ReportOptions) -> int:
         text = page(reports, progress, language)
     write_atomically(output, text)
     for report in reports:
-        sentences = (report.finding.headline, *report.finding.sentences, *report.cautions)
-        print(f"{report.bridge.id}: {' '.join(sentences)}")
+        finding = " ".join((report.finding.headline, *report.finding.sentences))
+        for line in (finding, *report.cautions):
+            print(f"{report.bridge.id}: {line}")
     if not reports:
         print("no crossing of a known bridge")
     if asked.baseline is None and len(files) > 1:

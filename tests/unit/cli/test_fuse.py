@@ -56,6 +56,25 @@ def test_element_weak_in_the_baseline_is_named(
     assert words in finding
 
 
+@pytest.mark.parametrize("by", ["--baseline", "--site"])
+def test_simulated_baseline_of_measured_crossings_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], by: str
+) -> None:
+    first = write(tmp_path / "first.json", [crossing(n) for n in range(2)])
+    before = tmp_path / "before.json"
+    assert main(["fuse", str(first), "--json", str(before)]) == 0
+    bridge = paper_site().bridges[0].model_copy(update={"baseline": "before.json", "elements": 5})
+    site = tmp_path / "site.toml"
+    site.write_text(site_toml(paper_site().model_copy(update={"bridges": (bridge,)})))
+    given = [by, str(before if by == "--baseline" else site)]
+    caution = "bridge-1: The baseline was simulated, these crossings were measured: a difference "
+    for realm, is_named in (("import-drives", True), ("sim-y", False)):
+        capsys.readouterr()
+        later = [crossing(n).model_copy(update={"realm": realm}) for n in range(2, 4)]
+        assert main(["fuse", str(write(tmp_path / "now.json", later)), *given]) == 0
+        assert (caution in capsys.readouterr().err) == is_named
+
+
 def test_baseline_of_the_site_file_is_compared_with(tmp_path: Path) -> None:
     first = write(tmp_path / "first.json", [crossing(n) for n in range(2)])
     assert main(["fuse", str(first), "--json", str(tmp_path / "before.json")]) == 0

@@ -255,6 +255,29 @@ def test_combined_surveys_are_announced_with_the_command(site: Site, then: Path)
     assert "are combined" not in first_page(reported(site, first, second, baseline=then))
 
 
+@pytest.mark.parametrize(
+    ("realms", "words"),
+    [
+        (("sim-a", "import-drives"), "The baseline was simulated, these crossings were measured"),
+        (("live", "sim-a"), "These crossings were simulated, the baseline was measured"),
+        (("sim-a", "sim-b"), ""),
+        (("import-2025", "live"), ""),
+    ],
+)
+def test_baseline_of_another_origin_is_the_first_caution(
+    site: Site, tmp_path: Path, realms: tuple[str, str], words: str
+) -> None:
+    then, now = (
+        results_of(site, some_crossing(name) | {"realm": realm}, used=name)
+        for name, realm in zip("ab", realms, strict=True)
+    )
+    path = tmp_path / "then.json"
+    path.write_text(results_json(then))
+    cautions = report_on(site, now, baseline=path).cautions
+    assert [one for one in cautions if "simulated" in one] == ([cautions[0]] if words else [])
+    assert not words or cautions[0].startswith(words)
+
+
 def test_comparison_of_the_same_crossings_is_announced(site: Site, tmp_path: Path) -> None:
     path = tmp_path / "same.json"
     results = results_of(site, some_crossing("a"), used="a")
