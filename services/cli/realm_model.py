@@ -343,10 +343,18 @@ def alarm_state(alarm: Alarm) -> str:
     return "active" if note is None else f"acknowledged by {one_line(note.by)}"
 
 
-def service_figures(service: ServiceRow) -> str:
-    """Return the figures of a service that are shown besides its health."""
+def service_figures(service: ServiceRow, age_s: float | None = None) -> str:
+    """Return the figures of a service that are shown besides its health.
+
+    With the age of its message, the time of the longest identification goes on.
+    """
     known = service.figures
     parts = []
+    number = round(known.get("identifying", 0.0))
+    if age_s is not None and number:
+        longest_s = known.get("identifying_longest_s", 0.0) + max(age_s, 0.0)
+        several = f" {number}, the first" if number > 1 else ""
+        parts.append(f"identifying{several} for {longest_s:.0f} s")
     if "rate_per_s" in known:
         parts.append(f"{known['rate_per_s']:.0f} messages/s")
     parts += [f"{name} {known[name]:.0f}" for name in ("queue", "lost", "dropped") if name in known]

@@ -309,7 +309,9 @@ def _services(model: RealmModel, silent: Set[str], now_ns: int, *, is_connected:
             state = Text("not well", style="red")
         work = "" if name in silent or not is_connected else model.work.get(name, "")
         is_plain = service.ended and service.ok
-        notes = ["" if is_plain else service_figures(service), work]
+        is_counting = name not in silent and is_connected and not service.ended
+        figures = service_figures(service, age_s if is_counting else None)
+        notes = ["" if is_plain else figures, work]
         table.add_row(name, state, "; ".join(one for one in notes if one))
     return table
 

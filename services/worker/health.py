@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
 from typing import NamedTuple
 
 from schemas.proto import driveby_pb2 as pb
@@ -75,7 +76,8 @@ def publish_health(
 ) -> None:
     """Publish `health`; `verdicts` are the results of this run, `note` why crossings wait."""
     running = execution.running
-    notes = [f"{name} is being identified for {seconds:.0f} s" for name, seconds in running]
+    now_s = time.time()
+    notes = [f"{name} is being identified since {_clock(now_s - s)} UTC" for name, s in running]
     notes += [f"{load.waiting} wait for a process"] if load.waiting else []
     recorded = load.in_recordings._asdict().items()
     notes += [f"{n} in recordings wait {_CAUSES[cause]}" for cause, n in recorded if n]
@@ -91,10 +93,15 @@ def publish_health(
     } | {f"crossings/{verdict}": float(number) for verdict, number in verdicts.items()}
     health = pb.Health(
         schema_version=1,
-        time_ns=time.time_ns(),
+        time_ns=round(1e9 * now_s),
         service=service_id,
         ok=True,
         figures=figures,
         note="; ".join(notes)[:_LONGEST_NOTE],
     )
     publish(health.SerializeToString())
+
+
+def _clock(time_s: float) -> str:
+    """Return the time of day of an event, which stays true while the message is kept."""
+    return f"{datetime.fromtimestamp(time_s, UTC):%H:%M:%S}"

@@ -73,7 +73,8 @@ def test_a_morning_on_a_wide_terminal(site: Site) -> None:
     assert line(lines, "14:23:16").endswith("truck-2 → bridge-1 on the bridge")
     assert "60 % less stiff than the other elements" in line(lines, "bridge-1")
     assert line(lines, "logger") == "logger well 120 messages/s, queue 3, lost 0, dropped 0"
-    assert "5 done, 1 waiting" in lines[0]
+    assert line(lines, "worker") == "worker well identifying for 20 s, queue 14"
+    assert lines[0].endswith("UTC  5 done, 1 waiting")
 
 
 @pytest.mark.parametrize("width", [40, 80, 120])
@@ -231,6 +232,20 @@ def test_a_service_that_is_silent_or_unwell_stands_out() -> None:
     silent = line(drawn(watched), "worker")
     assert silent.startswith("worker silent 17 min")
     assert "validating" not in silent
+
+
+def test_time_of_an_identification_goes_on_between_messages() -> None:
+    """Its health comes once a minute."""
+    watched = RealmModel()
+    for number, expected in ((1.0, "identifying for"), (3.0, "identifying 3, the first for")):
+        deliver(watched, health("worker", identifying=number, identifying_longest_s=8.0))
+        row = watched.services["worker"]
+        for age_s in (0.0, 40.0, -1.0):
+            watched.services["worker"] = row._replace(time_ns=NOW_NS - round(age_s * 1e9))
+            shown = line(drawn(watched), "worker")
+            assert shown == f"worker well {expected} {8.0 + max(age_s, 0.0):.0f} s"
+    watched.services["worker"] = row._replace(time_ns=NOW_NS - 95 * 10**9)
+    assert line(drawn(watched), "worker") == "worker silent 95 s"
 
 
 def test_overdue_service_is_silent() -> None:

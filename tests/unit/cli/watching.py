@@ -177,7 +177,7 @@ def a_morning(site: Site) -> RealmModel:
     deliver(watched, progress("worker", "d", "sampling", 0.45))
     deliver(watched, state("e", pb.DETECTED, "truck-2", 596.0))
     deliver(watched, health("logger", rate_per_s=120.0, queue=3.0, lost=0.0, dropped=0.0))
-    deliver(watched, health("worker", queue=14.0))
+    deliver(watched, health("worker", queue=14.0, identifying=1.0, identifying_longest_s=8.0))
     return watched
 
 
@@ -217,5 +217,5 @@ def a_fleet(site: Site) -> RealmModel:
     deliver(watched, alarm("bridge-03", by="the owner", element=2, since=1.7809e9, raised=1.783e9))
     deliver(watched, alarm("bridge-07"))
     deliver(watched, health("logger", rate_per_s=120.0, queue=3.0, lost=0.0, dropped=0.0))
-    deliver(watched, health("worker", queue=14.0))
+    deliver(watched, health("worker", queue=14.0, identifying=1.0, identifying_longest_s=8.0))
     return watched
