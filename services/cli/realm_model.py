@@ -3,6 +3,7 @@
 No bus, no terminal, no clock: the time is given with each message.
 """
 
+import math
 from collections import deque
 from typing import Final, NamedTuple
 
@@ -121,15 +122,22 @@ class ServiceRow(NamedTuple):
     ended: bool = False
     """Whether it has stopped in order."""
 
+    @property
+    def is_worker(self) -> bool:
+        """Whether it identifies crossings."""
+        return "identifying" in self.figures
+
 
 class RealmModel:
     """State of one realm, of bounded size.
 
-    `sees_trucks` is whether the credentials permit to read trucks' data.
+    `sees_trucks` is whether the credentials permit to read trucks' data, `began_s` the steady time
+    from which on messages are received.
     """
 
-    def __init__(self, *, sees_trucks: bool = True) -> None:
+    def __init__(self, *, sees_trucks: bool = True, began_s: float = -math.inf) -> None:
         self._sees_trucks = sees_trucks
+        self.began_s = began_s
         self.trucks: dict[str, TruckRow] = {}
         self.crossings: dict[str, CrossingRow] = {}
         """Crossings by identity, in the order of their first messages."""

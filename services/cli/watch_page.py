@@ -38,6 +38,9 @@ _LATE_S: Final = 1.5 * HEALTH_PERIOD_S
 """Silence in s after which a service may have been killed: its progress is no longer shown."""
 _GONE_S: Final = 3.0
 """Absence in s after which a service is silent; one whose router restarts connects again sooner."""
+_ANSWER_S: Final = 2.0
+"""Time in s in which a worker answers a new listener."""
+NO_WORKER: Final = "no worker answers"
 _MAX_ALARMS: Final = 4
 """Maximum number of alarm lines at the head of a page, fewer on a low one."""
 _MAX_BRIDGES: Final = 4
@@ -82,7 +85,9 @@ def page(
     taken += (bool(model.bridges) and not alarms) + (listening.lost_s is not None)
     room = max(8 - len(alarms), height - taken)
     most_trucks = max(2, min(len(trucks), room // 3))
-    parts: list[RenderableType] = [_headline(model, where, now_ns)]
+    silent = silent_services(model, listening, now_s, now_ns)
+    is_worked = listening.lost_s is not None or has_worker(model, silent, now_s)
+    parts: list[RenderableType] = [_headline(model, where, now_ns, is_worked=is_worked)]
     if listening.lost_s is not None:
         lost = f"connection to the router lost {_length(now_s - listening.lost_s)} ago"
         parts.append(Text(lost, style="bold red", no_wrap=True, overflow="ellipsis"))
@@ -107,7 +112,6 @@ def page(
         standing = {name for name, one in model.alarms.items() if one.acknowledged is None}
         parts.append(_bridges(model.bridges, standing))
     if model.services:
-        silent = silent_services(model, listening, now_s, now_ns)
         parts.append(_services(model, silent, now_ns, is_connected=listening.lost_s is None))
     spaced = [
         one for part in parts for one in ([Text()] if isinstance(part, Table) else []) + [part]
@@ -147,19 +151,30 @@ def silent_services(
     )
 
 
+def has_worker(model: RealmModel, silent: Set[str], now_s: float) -> bool:
+    """Return whether a worker answers, or may not have had the time to."""
+    return now_s - model.began_s < _ANSWER_S or any(
+        one.is_worker and not one.ended and name not in silent
+        for name, one in model.services.items()
+    )
+
+
 def _sorted_trucks(model: RealmModel, now_s: float) -> list[tuple[str, TruckRow]]:
     """Return the trucks, driving ones first."""
     silent = silent_trucks(model, now_s)
     return sorted(model.trucks.items(), key=lambda item: (item[0] in silent, item[0]))
 
 
-def _headline(model: RealmModel, where: str, now_ns: int) -> Text:
+def _headline(model: RealmModel, where: str, now_ns: int, *, is_worked: bool) -> Text:
     over = [row for row in model.crossings.values() if row.is_over]
     text = Text(no_wrap=True, overflow="ellipsis")
     text.append("driveby watch", style="bold")
     text.append(f"  {where}  {_clock(now_ns)} UTC  ")
-    text.append(f"{len(over)} done, {model.waiting} waiting", style="dim")
-    return text
+    counts = f"{len(over)} done, {model.waiting} waiting"
+    if is_worked:
+        return text.append(counts, style="dim")
+    text.append(NO_WORKER, style="yellow")
+    return text.append(f"; {counts}" if model.crossings else "", style="dim")
 
 
 def _trucks(trucks: Sequence[tuple[str, TruckRow]], listening: ListenerView, now_s: float) -> Table:

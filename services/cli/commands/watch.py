@@ -50,7 +50,9 @@ def _watch(asked: WatchOptions) -> int:
     ):
         if heard is None:
             return 0
-        model = RealmModel(sees_trucks=sees_trucks(asked.tls, asked.realm))
+        model = RealmModel(
+            sees_trucks=sees_trucks(asked.tls, asked.realm), began_s=time.monotonic()
+        )
         if console.is_terminal:
             _show_page(model, heard, endpoint, stop, console)
         else:
@@ -95,10 +97,11 @@ def _print_lines(
 ) -> None:
     from services.bus.realm_listener import other_realms_hint
     from services.cli.presence_lines import NOTHING_ABSENT, presence_lines
-    from services.cli.watch_page import NO_ALARM
+    from services.cli.watch_page import NO_ALARM, NO_WORKER, has_worker
 
     began_s = time.monotonic()
     hinted, absent, is_monitoring_named = "", NOTHING_ABSENT, False
+    is_worker_named = False
 
     def print_line(line: str | None) -> None:
         if line is not None:
@@ -112,8 +115,12 @@ def _print_lines(
         absent, lines = presence_lines(absent, model, listening, now_s, time.time_ns())
         for line in lines:
             print_line(line)
-        hint = other_realms_hint(listening.realm, listening.elsewhere) or ""
         is_empty = not model.trucks and not model.crossings
+        if not is_empty and not is_worker_named and now_s - began_s > _HINT_AFTER_S:
+            is_worker_named = True
+            if not has_worker(model, absent.services.keys(), now_s):
+                print_line(NO_WORKER)
+        hint = other_realms_hint(listening.realm, listening.elsewhere) or ""
         if is_empty and hint != hinted and now_s - began_s > _HINT_AFTER_S:
             hinted = hint
             print_line(hint or None)

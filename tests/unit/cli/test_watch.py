@@ -2,6 +2,7 @@
 
 import io
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -232,6 +233,22 @@ def test_a_service_that_is_silent_or_unwell_stands_out() -> None:
     silent = line(drawn(watched), "worker")
     assert silent.startswith("worker silent 17 min")
     assert "validating" not in silent
+
+
+def test_absent_worker_is_named_in_place_of_no_waiting(site: Site) -> None:
+    watched, listened = a_morning(site), Listened()
+    del watched.services["worker"]
+    assert drawn(watched)[0].endswith("UTC  no worker answers; 5 done, 1 waiting")
+    assert drawn(RealmModel())[0].endswith("UTC  no worker answers")
+    assert drawn(RealmModel(began_s=NOW_S - 1.0))[0].endswith("UTC  0 done, 0 waiting")
+    deliver(watched, health("worker", ended=True, identifying=0.0))
+    assert "no worker answers" in drawn(watched)[0]
+    deliver(watched, health("worker-b", identifying=0.0))
+    assert "no worker answers" not in drawn(watched)[0]
+    listened.gone_s = {"worker-b": NOW_S - 4.0}
+    assert "no worker answers" in drawn(watched, listened=listened)[0]
+    listened.lost_s = NOW_S - 4.0
+    assert "no worker answers" not in drawn(watched, listened=listened)[0]
 
 
 def test_time_of_an_identification_goes_on_between_messages() -> None:
@@ -493,6 +510,19 @@ class Batches(Listened):
         if len(self._batches) == 1:
             self.stop.set()
         return self._batches.pop(0)
+
+
+def test_absent_worker_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watch, "_HINT_AFTER_S", 0.0)
+    monkeypatch.setattr(watch, "_PERIOD_S", 0.0)
+    fresh = pb.Health(service="worker", time_ns=time.time_ns(), ok=True, figures={"identifying": 0})
+    worker = heard("service", "worker", "health", fresh.SerializeToString())
+    crossing = state("d", pb.DETECTED, "truck-1", 550.0)
+    for messages, expected in (([], 0), ([crossing], 1), ([crossing, worker], 0)):
+        printed: list[str] = []
+        listened = Batches([messages, [], []])
+        watch._print_lines(RealmModel(), listened, listened.stop, printed.append)  # type: ignore[arg-type]
+        assert sum(one.endswith(" no worker answers") for one in printed) == expected
 
 
 def test_lines_without_an_alarm_are_no_reassurance(
