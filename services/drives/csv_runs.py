@@ -87,7 +87,7 @@ def understood_runs(
             if not all(path.exists() for path in sources):
                 raise
         else:
-            return Understood(runs, notes_of(runs, site), ImportMap())
+            return Understood(runs, notes_of(runs, site, vehicle), ImportMap())
     declared = next(iter(rates_hz(site.sensor, vehicle).values()))
     target = Target(site, vehicle, declared, how.zone, how.start, how.is_draft)
     try:
@@ -96,7 +96,7 @@ def understood_runs(
             check_plausible(run, site, None)
     except InputError as error:
         raise _better(exact, error) from error
-    return found._replace(guesses=[*found.guesses, *notes_of(found.runs, site)])
+    return found._replace(guesses=[*found.guesses, *notes_of(found.runs, site, vehicle)])
 
 
 def exact_runs(

@@ -9,6 +9,7 @@ import numpy as np
 from schemas.signals import CHANNELS
 from schemas.site import Site, Vehicle
 from services.common.errors import InputError
+from services.drives.gaps import gap_notes
 from services.drives.runs import Run
 from services.drives.tables import judged
 from services.drives.tables.clocks import clock_note
@@ -107,10 +108,12 @@ def _check_speed(run: Run) -> None:
         raise InputError(f"{run.source}: speed_mps is {ratio:.2f} times the speed of the positions")
 
 
-def notes_of(runs: Sequence[Run], site: Site) -> list[Guess]:
-    """Return notes on what is strange in a drive and may be right."""
+def notes_of(runs: Sequence[Run], site: Site, vehicle: Vehicle) -> list[Guess]:
+    """Return notes on what is strange in a drive and may be right, and on its gaps."""
     return [
-        Guess(Path(run.source).name, words, "lost") for run in runs for words in _strange(run, site)
+        Guess(Path(run.source).name, words, "lost")
+        for run in runs
+        for words in (*_strange(run, site), *gap_notes(run, site, vehicle))
     ]
 
 
