@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from math import inf
-from typing import Final
+from typing import Final, NamedTuple
 
 from pre_core.survey.detection import DETECTION_PROBABILITY
 from services.common.naming import count_of
@@ -24,6 +24,17 @@ _WORTH_NAMING: Final = 0.75
 """Share of the plan's crossings or smallest loss below which an alternative is worth a sentence."""
 _SMALLER_LOSS: Final = 0.95
 """The same share of the smallest loss where no number of crossings detects the loss in question."""
+
+
+class _Change(NamedTuple):
+    """A change of the plan that helps."""
+
+    text: str
+    gain: str
+    cost: int
+    """Rank of its cost; 0: none."""
+    rank: tuple[float, float, float]
+    """Rank of its effect; less is better."""
 
 
 def advice(found: SurveyForecast) -> str:
@@ -99,16 +110,45 @@ def _of_the_others(found: SurveyForecast) -> str:
         if one.plan.site.bridges[0].elements == elements
         and (has_tandem or one.plan.site.vehicles[0].tandem is None)
     ]
-    better = sorted((one for one in same if _helps(one, planned)), key=_rank)
+    better = [
+        _Change(_change(one), _gain(one, found), one.plan.cost, _rank(one))
+        for one in same
+        if _helps(one, planned)
+    ]
+    better = sorted([*better, *_other_speeds(found)], key=lambda one: (one.cost, one.rank))
     tandem = f"{TANDEM}, by less than its row states." if _is_tandem_advised(found) else ""
     if not better:
         other = "No other change of truck, load, direction or sensors helps much."
         return f"What helps is {tandem}" if tandem else other
-    best, *rest = better
-    sentence = f"What helps most: {_change(best)}; then {_gain(best, found)}."
-    if rest:
-        sentence += f" Next best: {_change(rest[0])} (then {_gain(rest[0], found)})."
+    first, *rest = better
+    is_best = all(first.rank <= one.rank for one in rest)
+    how = "at no cost" if first.cost == 0 else "most" if is_best else "at the least cost"
+    sentence = f"What helps {how}: {first.text}; then {first.gain}."
+    more = [one for one in rest if one.rank < first.rank]
+    for second in (more or rest)[:1]:
+        how = "What helps more" if more else "Next best"
+        sentence += f" {how}: {second.text} (then {second.gain})."
     return f"{sentence} So does {tandem}" if tandem else sentence
+
+
+def _other_speeds(found: SurveyForecast) -> Iterator[_Change]:
+    """Yield the speed that detects the smallest loss, if it helps.
+
+    These forecasts are of one speed, so they are compared with that of the planned speed.
+    """
+    if not found.speeds:
+        return
+    planned, (middle, ends) = found.planned, _needed(found.planned)
+    limit = float(planned.expected.smallest_loss[planned.middle])
+    wanted = found.question.speed_m_per_s
+    usual = min(found.speeds, key=lambda one: abs(one.speed_m_per_s - wanted))
+    best = min(found.speeds, key=lambda one: one.smallest_middle)
+    share = _WORTH_NAMING if middle < inf else _SMALLER_LOSS
+    if best.smallest_middle < share * min(limit, usual.smallest_middle):
+        detecting = _detecting(found.question.crossings)
+        gain = f"{detecting} a loss of {percent(best.smallest_middle)}"
+        rank = middle, ends, best.smallest_middle
+        yield _Change(f"driving at {best.speed_m_per_s:g} m/s", gain, 0, rank)
 
 
 def _is_tandem_advised(found: SurveyForecast) -> bool:

@@ -28,6 +28,8 @@ _UNEQUAL: Final = ("tyre_contact_length_m", "track_m")
 EQUAL_TYRES: Final = "equal single tyres on both axles"
 TANDEM: Final = "a truck with an equalised tandem"
 _OTHER_WAY = "half of the runs the other way"
+_MOVED_LOAD = "load moved to the heavier axle"
+_QUIET_SENSORS = "sensors of a quarter of the noise"
 
 
 class Plan(NamedTuple):
@@ -40,6 +42,16 @@ class Plan(NamedTuple):
     def label(self) -> str:
         """Name as printed: JSON keeps that of the first version."""
         return "half in the other direction" if self.name == _OTHER_WAY else self.name
+
+    @property
+    def cost(self) -> int:
+        """Rank of its cost: 0 for the same truck driven otherwise, 1 for another, 2 for sensors.
+
+        Other tyres count as another truck, which can be hired. Sensors are bought and mounted.
+        """
+        if self.name == _MOVED_LOAD or self.fewest_crossings > 1:
+            return 0
+        return 2 if self.name == _QUIET_SENSORS else 1
 
     @property
     def fewest_crossings(self) -> int:
@@ -71,7 +83,7 @@ def alternatives(site: Site, speed_m_per_s: float) -> Iterator[Plan]:
         )
     if vehicle.tandem is None and loads_are_alike(vehicle):
         yield Plan(
-            "load moved to the heavier axle",
+            _MOVED_LOAD,
             (_spread(_with_vehicle(site, _moved(vehicle)), speed_m_per_s),),
         )
     yield Plan(
@@ -79,9 +91,7 @@ def alternatives(site: Site, speed_m_per_s: float) -> Iterator[Plan]:
         (planned, tuple(crossing._replace(forward=False) for crossing in planned)),
     )
     quiet = tuple(_QUIETER * density for density in site.sensor.noise_density_ug_per_rthz)
-    yield Plan(
-        "sensors of a quarter of the noise", (_spread(with_noise(site, quiet), speed_m_per_s),)
-    )
+    yield Plan(_QUIET_SENSORS, (_spread(with_noise(site, quiet), speed_m_per_s),))
     for elements in _ELEMENTS:
         if len(bridge.lengths_of_spans_m) <= elements < bridge.elements:
             coarser = site.model_copy(update={"bridges": (_coarser(bridge, elements),)})

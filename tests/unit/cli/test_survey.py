@@ -49,7 +49,7 @@ def test_a_plan_of_the_example(
     growth = {one["crossings"]: one["std_ln_ei"] for one in plan["growth"]}
     assert (np.diff([growth[count] for count in sorted(growth)], axis=0) <= 0.0).all()
     assert growth[planned["crossings"]] == whole
-    best = "What helps most: equal single tyres on both axles, on equal tracks to a centimetre; "
+    best = "equal single tyres on both axles, on equal tracks to a centimetre"
     assert best in plan["advice"]
     assert "\nequal single tyres: on equal tracks, to a centimetre;\n" in out
     assert plan["advice"] in out

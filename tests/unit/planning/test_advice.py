@@ -2,6 +2,7 @@
 
 import re
 from itertools import pairwise, product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,13 @@ from services.planning.advice import advice
 from services.planning.alternatives import TANDEM, as_planned, with_noise
 from services.planning.crossings import PlannedRoad
 from services.planning.forecast_text import lines_of
-from services.planning.survey import PlanForecast, SurveyExpectation, SurveyForecast, SurveyQuestion
+from services.planning.survey import (
+    PlanForecast,
+    SpeedForecast,
+    SurveyExpectation,
+    SurveyForecast,
+    SurveyQuestion,
+)
 from services.simulation.drive import paper_site
 from services.simulation.usual_trucks import usual_tandem
 
@@ -56,7 +63,7 @@ def forecast(
 
 def named(found: SurveyForecast) -> list[str]:
     """Return the alternatives that the advice names, the best one first."""
-    return re.findall(r"(?:helps most:|Next best:) (\w+)", advice(found))
+    return re.findall(r"(?:helps most:|helps more:|Next best:) (\w+)", advice(found))
 
 
 def test_fewer_crossings_come_before_a_smaller_loss() -> None:
@@ -95,6 +102,40 @@ def test_ties_are_ranked_by_the_ends_then_by_the_loss() -> None:
     assert named(ties) == ["c", "b"]
     same = forecast((9, 40, 0.3), same=(9, 40, 0.2))
     assert "helps most: same; then 12 crossings detect a loss of 20 %." in advice(same)
+
+
+def test_free_change_comes_before_better_sensors() -> None:
+    """The sensors detect more, and are bought; a loaded truck costs nothing."""
+    quiet, loaded = "sensors of a quarter of the noise", "half of the runs at 13.7 t"
+    rows: dict[str, Any] = {quiet: (20, None, 0.3), loaded: (None, None, 0.4)}
+    found = forecast((None, None, 0.5), **rows)
+    assert (
+        f"What helps at no cost: {loaded}; then 12 crossings detect a loss of 40 %. "
+        f"What helps more: {quiet} (then 20 crossings detect it"
+    ) in advice(found)
+    weak = forecast((None, None, 0.5), **(rows | {quiet: (None, None, 0.45)}))
+    assert f"Next best: {quiet} (then 12 crossings detect a loss of 45 %)." in advice(weak)
+
+
+def test_other_tyres_come_before_better_sensors() -> None:
+    quiet, tyres = "sensors of a quarter of the noise", "equal single tyres on both axles"
+    rows: dict[str, Any] = {quiet: (20, None, 0.3), tyres: (40, None, 0.3)}
+    found = forecast((None, None, 0.5), **rows)
+    assert f"What helps at the least cost: {tyres}, on equal tracks" in advice(found)
+    assert f"What helps more: {quiet} (" in advice(found)
+
+
+def test_speed_that_helps_is_a_free_change() -> None:
+    def at(speed: float, smallest: float) -> SpeedForecast:
+        return SpeedForecast(speed, 0.2, 0.1, 0.1, smallest)
+
+    found = forecast((None, None, 0.5))
+    slow = found._replace(speeds=(at(5.0, 0.4), at(10.0, 0.48), at(20.0, 0.6)))
+    assert "What helps at no cost: driving at 5 m/s; then 12 crossings detect a loss of 40 %" in (
+        advice(slow)
+    )
+    # One speed instead of several is the cause here, not another speed.
+    assert NONE_HELPS in advice(found._replace(speeds=(at(5.0, 0.4), at(10.0, 0.41))))
 
 
 def test_single_crossing_has_its_verb() -> None:
