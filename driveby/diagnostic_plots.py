@@ -8,15 +8,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from pre_core.constants import NORMAL_975
 from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.notebook.arguments import names_of
 from services.notebook.inference import prior_draws
+from services.notebook.residual_size import TREND_DEGREE, expected_std_m
 from services.notebook.solution import Identification, Solution, one_solution
 from services.viewer.drawing import MUTED, STYLE, mark_bridge, simplify_axes
 
 _BRIDGE: Final = "#e3ebf0"
 _COLUMNS: Final = 4
+_EXPECTED_OPACITY: Final = 0.2
 _BINS: Final = 60
 _SHOWN: Final = 6.0
 """Posterior standard deviations on either side of the mean that are drawn."""
@@ -30,8 +33,9 @@ def plot_residual(solution: Solution | Identification) -> Figure:
     """Draw the profile under the front wheel minus that under the rear wheel, over the chainage.
 
     Long waves, the drift of twice integrated accelerations, have little weight in the fit; a cubic
-    trend shows them. The RMS is given with and without it. Raise InputError for a crossing without
-    a road profile.
+    trend shows them. The RMS is given with and without it. A band about the trend has the expected
+    size: 95 % of the differences by the declared noise of the axles' sensors and the estimated
+    profile mismatch. Raise InputError for a crossing without a road profile.
     """
     solution = one_solution("solution", solution, "plot_residual")
     road = solution.crossing.road
@@ -39,13 +43,25 @@ def plot_residual(solution: Solution | Identification) -> Figure:
         raise InputError(f"{solution.crossing.crossing_id}: has no road profile")
     x_m, bridge = np.asarray(road.x_m), solution.bridge
     difference_mm = 1e3 * (np.asarray(road.front_m) - np.asarray(road.rear_m))
-    trend_mm = np.polynomial.Polynomial.fit(x_m, difference_mm, 3)(x_m)
+    trend_mm = np.polynomial.Polynomial.fit(x_m, difference_mm, TREND_DEGREE)(x_m)
+    expected_m = expected_std_m(solution.crossing, road, solution.site)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(9.0, 3.3), layout="constrained")
         axes = figure.add_subplot()
         mark_bridge(axes, (0.0, *bridge.interior_supports_m, bridge.span_m))
         axes.patches[0].set(label="bridge", facecolor=_BRIDGE)
         axes.axhline(0.0, color=MUTED, lw=0.8)
+        if expected_m is not None:
+            half_mm = 1e3 * NORMAL_975 * expected_m
+            axes.fill_between(
+                x_m,
+                trend_mm - half_mm,
+                trend_mm + half_mm,
+                color="C1",
+                alpha=_EXPECTED_OPACITY,
+                lw=0.0,
+                label=f"expected about the trend, 95 %: {_causes(solution)}",
+            )
         every, short = _rms(difference_mm), _rms(difference_mm - trend_mm)
         axes.plot(
             x_m,
@@ -59,8 +75,16 @@ def plot_residual(solution: Solution | Identification) -> Figure:
         axes.set_xlabel("chainage from the start of the bridge (m)")
         axes.set_ylabel("front − rear (mm)")
         simplify_axes(axes)
-        figure.legend(loc="outside lower center", ncols=3)
+        figure.legend(loc="outside lower center", ncols=2)
     return figure
+
+
+def _causes(solution: Solution) -> str:
+    """Return the causes of the expected difference in words."""
+    road = solution.crossing.road
+    noise = [] if solution.site is None else ["sensor noise"]
+    mismatch = [] if road is None or road.mismatch is None else ["profile mismatch"]
+    return " and ".join(noise + mismatch)
 
 
 def _rms(values: Floats) -> float:

@@ -72,7 +72,8 @@ def identify(
     execution = InlineExecutor(report=report, keep=keep)
     found = identify_drives(index_messages(name, read, known), known, settings, execution, report)
     solutions = (
-        Solution(c, known.bridge(c.bridge), kept.get(c.crossing_id, {})) for c in found.crossings
+        Solution(c, known.bridge(c.bridge), kept.get(c.crossing_id, {}), known)
+        for c in found.crossings
     )
     return Identification(tuple(solutions), found, known)
 

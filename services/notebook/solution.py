@@ -49,6 +49,8 @@ class Solution(NamedTuple):
     They are empty for a rejected crossing, without `draws=True`, and for methods without draws
     (`least_squares`, `random_walk`).
     """
+    site: Site | None = None
+    """Site file by which it was identified."""
 
     def __repr__(self) -> str:
         """Return one line."""

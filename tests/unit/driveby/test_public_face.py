@@ -929,6 +929,29 @@ def test_simulate_recording_takes_the_options_of_the_command(
     assert len(given) == 1
 
 
+def test_residual_has_a_band_of_its_expected_size(found: driveby.Identification) -> None:
+    """Nearly all differences of a good crossing lie in it, and they fill it."""
+    (solution,) = found.solutions
+    figure = driveby.plot_residual(solution)
+    (axes,) = figure.axes
+    (band,) = axes.collections
+    vertices = band.get_paths()[0].vertices
+    road = solution.crossing.road
+    assert road is not None
+    drawn = {line.get_label().split(":")[0]: line.get_ydata() for line in axes.lines}
+    x_m = np.array(road.x_m)
+    upper = np.array([vertices[np.isclose(vertices[:, 0], x), 1].max() for x in x_m])
+    half_mm = upper - drawn["cubic trend"]
+    size = np.abs(drawn["difference"] - drawn["cubic trend"]) / half_mm
+    assert 0.8 < np.mean(size <= 1.0) <= 1.0
+    assert np.max(size) > 0.3
+    (legend,) = figure.legends
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert "expected about the trend, 95 %: sensor noise" in labels
+    alone = driveby.plot_residual(solution._replace(site=None)).axes[0]
+    assert (len(alone.collections) == 1) == (road.mismatch is not None)
+
+
 def test_diagnostic_plots_have_a_panel_for_each_parameter(found: driveby.Identification) -> None:
     (solution,) = found.solutions
     (residual,) = driveby.plot_residual(solution).axes
