@@ -20,6 +20,11 @@ from services.viewer.drawing import MUTED, STYLE, mark_bridge, simplify_axes
 _BRIDGE: Final = "#e3ebf0"
 _COLUMNS: Final = 4
 _EXPECTED_OPACITY: Final = 0.2
+_PRIOR: Final = "0.8"
+_BELOW_ZERO: Final = 0.04
+"""Part of the axis below zero for a parameter that is never negative."""
+_VISIBLE: Final = 0.2
+"""Height of a density over its maximum from which it is seen."""
 _BINS: Final = 60
 _SHOWN: Final = 6.0
 """Posterior standard deviations on either side of the mean that are drawn."""
@@ -97,6 +102,9 @@ def plot_posterior(
 ) -> Figure:
     """Draw prior and posterior density of parameters, by default of all EI, with 95 % intervals.
 
+    Each density is relative to its own maximum: a wide prior would be a flat line next to a narrow
+    posterior. The axis reaches the prior where the posterior is far from it.
+
     Raise InputError for an unknown name or a crossing without draws.
     """
     solution = one_solution("solution", solution, "plot_posterior")
@@ -106,26 +114,46 @@ def plot_posterior(
             found = solution.value[name]
             divisor, unit = _shown_unit(found.mean, found.unit)
             draws = solution.draws[name].ravel() / divisor
+            window = (found.mean + np.array([-_SHOWN, _SHOWN]) * found.std) / divisor
             if found.prior is not None:
                 prior = prior_draws(found.prior) / divisor
                 limits = np.percentile(prior, _CUT)
-                axes.hist(
-                    prior,
-                    bins=_BINS,
-                    range=(limits[0], limits[1]),
-                    density=True,
-                    color="0.8",
-                    label="prior",
-                )
-            axes.hist(draws, bins=_BINS, density=True, alpha=_POSTERIOR_OPACITY, label="posterior")
+                if found.prior.distribution == "half_normal":
+                    limits[0] = 0.0
+                heights, edges = _density(prior, limits)
+                axes.stairs(heights, edges, fill=True, color=_PRIOR, label="prior")
+                window = _reaching(window, prior, heights, edges)
+                if found.prior.distribution in ("half_normal", "log_normal"):
+                    window[0] = max(window[0], -_BELOW_ZERO * window[1])
+            heights, edges = _density(draws, np.array([draws.min(), draws.max()]))
+            axes.stairs(
+                heights, edges, fill=True, color="C0", alpha=_POSTERIOR_OPACITY, label="posterior"
+            )
             for limit in (found.q025, found.q975):
                 axes.axvline(limit / divisor, color="0.3", lw=0.8, ls="--")
-            reach = np.array([-_SHOWN, _SHOWN]) * found.std
-            axes.set_xlim(*((found.mean + reach) / divisor))
+            axes.set_xlim(*window)
+            axes.set_ylim(0.0, 1.08)
             axes.set_xlabel(unit)
             axes.set_yticks([])
-        figure.axes[0].legend(fontsize="small")
+        figure.supylabel("density over its maximum", fontsize="medium")
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=2)
     return figure
+
+
+def _density(draws: Floats, limits: Floats) -> tuple[Floats, Floats]:
+    """Return heights (bins,) of a histogram between limits, at most one, and its edges."""
+    counts, edges = np.histogram(draws, bins=_BINS, range=(limits[0], limits[1]))
+    return counts / max(counts.max(), 1), edges
+
+
+def _reaching(window: Floats, prior: Floats, heights: Floats, edges: Floats) -> Floats:
+    """Return a window that reaches the middle half of a prior, unless it shows the prior anyway."""
+    is_inside = (edges[1:] > window[0]) & (edges[:-1] < window[1])
+    if heights[is_inside].max(initial=0.0) >= _VISIBLE:
+        return window
+    low, high = np.percentile(prior, (25.0, 75.0))
+    return np.array([min(window[0], low), max(window[1], high)])
 
 
 def plot_chains(solution: Solution | Identification, names: Sequence[str] | None = None) -> Figure:

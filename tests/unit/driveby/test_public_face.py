@@ -929,6 +929,28 @@ def test_simulate_recording_takes_the_options_of_the_command(
     assert len(given) == 1
 
 
+def prior_seen(axes: Any) -> float:
+    """Return the largest height of the prior within the axis, over that of the panel."""
+    heights, edges, _ = axes.patches[0].get_data()
+    low, high = axes.get_xlim()
+    is_inside = (edges[1:] > low) & (edges[:-1] < high)
+    return float(heights[is_inside].max(initial=0.0) / axes.get_ylim()[1])
+
+
+def test_prior_far_from_the_posterior_is_in_the_plot(found: driveby.Identification) -> None:
+    (solution,) = found.solutions
+    beta = solution.value["beta"]
+    assert beta.prior is not None
+    for factor in (0.01, 1.0, 100.0):
+        away = beta.prior.model_copy(update={"location": factor * beta.prior.location})
+        parameters = solution.value | {"beta": beta.model_copy(update={"prior": away})}
+        crossing = solution.crossing.model_copy(update={"parameters": parameters})
+        (axes,) = driveby.plot_posterior(solution._replace(crossing=crossing), ["beta"]).axes
+        assert prior_seen(axes) >= 0.2
+        low, high = axes.get_xlim()
+        assert low < beta.mean < high
+
+
 def test_residual_has_a_band_of_its_expected_size(found: driveby.Identification) -> None:
     """Nearly all differences of a good crossing lie in it, and they fill it."""
     (solution,) = found.solutions
@@ -975,9 +997,12 @@ def test_diagnostic_plots_have_a_panel_for_each_parameter(found: driveby.Identif
     assert {axes.get_xlabel() for axes in posterior} == {"GN·m²"}
     low_gn, high_gn = posterior[3].get_xlim()
     assert len(posterior) == solution.bridge.elements
-    prior, above = (posterior[0].containers[n][0] for n in (0, 1))
+    prior, above = posterior[0].patches
     assert prior.get_zorder() <= above.get_zorder()
     assert above.get_alpha() < 0.9  # the prior behind it shows
+    for name in ("beta", "EI_4", "rhoA"):
+        (axes,) = driveby.plot_posterior(solution, [name]).axes
+        assert prior_seen(axes) >= 0.2
     assert low_gn < solution.value["EI_4"].mean / 1e9 < high_gn
     chains = driveby.plot_chains(solution, ["rhoA", "EI_4"]).axes
     assert [axes.get_title(loc="left") for axes in chains] == ["rhoA", "EI_4"]
