@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -60,10 +60,25 @@ _SIGNS = {"good": "●", "unused": "○", "suspect": "◇", "rejected": "×"}
 _MARKERS = {"suspect": "D", "rejected": "X"}
 
 
+_SMALL, _SMALLER = 8.0, 6.5
+"""Sizes of the values of single crossings, in points; the latter for many elements."""
+_MANY = 11
 _ROW_IN = 0.2
 """Height of a line in the list of crossings."""
 _STEM = 0.05
 """Length of an arrow's line, relative to the height of its tip."""
+
+
+_FEWEST_DOTS = 2
+"""Number of crossings from which each has dots: one alone is the state."""
+
+
+class _Line(NamedTuple):
+    """A line of the list of crossings: a text with a sign, or EI / nominal of each element."""
+
+    sign: str
+    text: str
+    values: tuple[str, ...] = ()
 
 
 def bridge_figure(path: Path, bridge: BridgeView) -> None:
@@ -95,6 +110,7 @@ def draw_bridge(
     if with_heading:
         _draw_heading(figure, bridge, lines)
         _list_crossings(figure, listed, (list_in - 0.1) / height, _ROW_IN / height)
+        _write_values(figure, axes, bridge, listed, (list_in - 0.1) / height)
     return figure
 
 
@@ -187,7 +203,7 @@ def _label(
 
 def _dots(drawn: list[CrossingView], elements: int) -> Floats:
     """Return the estimates of single crossings in GN·m² (k, n); none of only one crossing."""
-    if len(drawn) < 2:
+    if len(drawn) < _FEWEST_DOTS:
         return np.zeros((0, elements))
     return np.array([c.rigidity_nm2 for c in drawn], dtype=np.float64) / 1e9
 
@@ -295,26 +311,46 @@ def _why_nothing(bridge: BridgeView) -> str:
     return "\n".join([*lines, *(f"• {text}" for text in list(reasons)[:6])])
 
 
-def _listed(bridge: BridgeView) -> list[tuple[str, str]]:
-    """Return the lines of the list of crossings, each with its sign; the last may count others."""
+def _listed(bridge: BridgeView) -> list[_Line]:
+    """Return the lines of the list of crossings; the last may count others."""
     listed = bridge.crossings[-_MAX_LISTED:]
     more = len(bridge.crossings) - len(listed)
     rows = [line for crossing in reversed(listed) for line in _rows(bridge, crossing)]
-    return rows + ([("", f"… and {more} earlier")] if more else [])
+    return rows + ([_Line("", f"… and {more} earlier")] if more else [])
 
 
-def _list_crossings(
-    figure: Figure, listed: Sequence[tuple[str, str]], top: float, step: float
-) -> None:
-    for number, (sign, row) in enumerate(listed):
+def _list_crossings(figure: Figure, listed: Sequence[_Line], top: float, step: float) -> None:
+    for number, (sign, row, _) in enumerate(listed):
         y = top - number * step
         colour = MUTED if row.startswith("…") else INK
         figure.text(LEFT, y, sign, fontsize=9, va="top")
         figure.text(LEFT + 0.018, y, row, fontsize=8.5, va="top", color=colour, parse_math=False)
 
 
-def _rows(bridge: BridgeView, crossing: CrossingView) -> list[tuple[str, str]]:
-    """Return the lines of a crossing with all of its reasons; the first has its sign."""
+def _write_values(
+    figure: Figure, axes: Axes, bridge: BridgeView, listed: Sequence[_Line], top: float
+) -> None:
+    """Write the values of single crossings below the elements, where their dots are."""
+    centres_m = bar_places(bridge.edges_m).centres_m
+    left, right = axes.get_xlim()
+    at = LEFT + (RIGHT - LEFT) * (centres_m - left) / (right - left)
+    size = _SMALLER if centres_m.size > _MANY else _SMALL
+    step = _ROW_IN / figure.get_figheight()
+    for number, line in enumerate(listed):
+        y = top - number * step
+        if line.values:
+            figure.text(
+                LEFT, y, "EI / nominal", fontsize=_SMALLER, ha="right", va="top", color=MUTED
+            )
+        for x, value in zip(at, line.values, strict=False):
+            figure.text(x, y, value, fontsize=size, ha="center", va="top", color=MUTED)
+
+
+def _rows(bridge: BridgeView, crossing: CrossingView) -> list[_Line]:
+    """Return the lines of a crossing with all of its reasons, and its values if it has a dot.
+
+    The first line has its sign.
+    """
     moment = datetime.fromtimestamp(crossing.entry_time_s, UTC)
     way = "start to end" if crossing.forward else "end to start"
     used = ", used" if crossing.crossing_id in bridge.used else ""
@@ -324,4 +360,10 @@ def _rows(bridge: BridgeView, crossing: CrossingView) -> list[tuple[str, str]]:
         f"{crossing.speed_m_per_s:.1f} m/s, {crossing.verdict}{used}{why}"
     )
     lines = textwrap.wrap(line, 116, subsequent_indent="    ")
-    return list(zip([_SIGNS[_kind_of(bridge, crossing)], *[""] * len(lines)], lines, strict=False))
+    signs = [_SIGNS[_kind_of(bridge, crossing)], *[""] * len(lines)]
+    rows = [_Line(sign, text) for sign, text in zip(signs, lines, strict=False)]
+    drawn = [one for one in bridge.crossings if one.rigidity_nm2 is not None]
+    if crossing.rigidity_nm2 is None or len(drawn) < _FEWEST_DOTS:
+        return rows
+    ratios = crossing.rigidity_nm2 / crossing.nominal_nm2
+    return [*rows, _Line("", "", tuple(f"{one:.3f}" for one in ratios))]

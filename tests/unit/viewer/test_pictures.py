@@ -382,3 +382,25 @@ def test_no_interval_of_a_crossing_is_cut(site: Site) -> None:
     assert len(ends) == 2 * 2 * 7
     assert low < min(ends) < max(ends) < high
     assert_words_apart(figure)
+
+
+def test_dots_of_single_crossings_have_their_values(site: Site) -> None:
+    """They are written in the list, each below its element."""
+    rejected = some_crossing("c", verdict="rejected", reasons=("channel_missing",), entry=180.0)
+    crossings = (some_crossing("a"), some_crossing("b", entry=90.0), rejected)
+    figure = draw_bridge(bridge_of(site, *crossings, used="a"))
+    figure.draw_without_rendering()
+    values = [text for text in figure.texts if re.fullmatch(r"\d\.\d{3}", text.get_text())]
+    expected = ["1.000", "0.980", "1.010", "0.400", "1.020", "1.000", "0.990"]
+    assert [text.get_text() for text in values] == 2 * expected
+    (axes, *_) = figure.axes
+    edges_m = np.linspace(0.0, 30.0, 8)
+    for text, centre_m in zip(
+        values, 2 * (0.5 * (edges_m[1:] + edges_m[:-1])).tolist(), strict=True
+    ):
+        box = text.get_window_extent()
+        at = axes.transData.transform((centre_m, 0.0))[0]
+        assert 0.5 * (box.x0 + box.x1) == pytest.approx(at, abs=1.0)
+    assert_words_apart(figure)
+    alone = draw_bridge(bridge_of(site, some_crossing("a"), used="a"))
+    assert "EI / nominal" not in written(alone)
