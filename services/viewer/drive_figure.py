@@ -31,6 +31,8 @@ from services.viewer.rerun_parts import channel_colour
 from services.viewer.vehicle_signals import VehicleSignals
 
 _HEIGHT_IN = 5.2
+_LONGEST_TITLE = 80
+"""Largest number of characters of a title; of a longer path the end is shown."""
 _MAX_RANGES = 1500
 """Largest number of ranges of values along the time."""
 _GAP_S = 3.0
@@ -73,10 +75,12 @@ def _draw(
     FigureCanvasAgg(figure)
     grid: Any = figure.subplots(3, 1, sharex=True)
     panels: list[Axes] = list(grid)
-    figure.subplots_adjust(left=LEFT, right=RIGHT, top=0.93, bottom=0.09, hspace=0.42)
+    figure.subplots_adjust(left=LEFT, right=RIGHT, top=0.86, bottom=0.11, hspace=0.42)
+    heading = title if len(title) <= _LONGEST_TITLE else f"…{title[1 - _LONGEST_TITLE :]}"
+    figure.text(LEFT, 0.975, heading, fontsize=12, fontweight="bold", va="top", parse_math=False)
     body = {name: one for name, one in curves.items() if not name.startswith("unsprung")}
     axles = {name: one for name, one in curves.items() if name.startswith("unsprung")}
-    _draw_curves(panels[0], f"{title}: body accelerations (m/s²)", body)
+    _draw_curves(panels[0], "Body accelerations (m/s²)", body)
     _draw_curves(panels[1], "Axle accelerations (m/s²)", axles)
     panels[2].set_title("Speed (m/s)")
     times, speed = _interrupted(fix_time_s, speed_m_per_s)
@@ -85,6 +89,7 @@ def _draw(
     form: Any = ConciseDateFormatter(locator, tz=UTC)  # type: ignore[no-untyped-call]
     panels[2].xaxis.set_major_locator(locator)
     panels[2].xaxis.set_major_formatter(form)
+    panels[2].set_xlabel("time (UTC)")
     for axes in panels:
         for crossing in crossings:
             begin, end = _days(np.array([crossing.entry_time_s, crossing.exit_time_s]))
