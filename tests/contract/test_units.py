@@ -90,9 +90,23 @@ def test_night_unit_runs_the_script_with_its_arguments() -> None:
     assert f"PATH={Path(PROGRAM).parent}:" in UNITS["night"].read_text()
 
 
+def test_installation_is_one_numbered_list_to_which_the_units_refer() -> None:
+    page = (ROOT / "docs/install.md").read_text()
+    steps = re.findall(r"^(\d)\. (.*)$", page, re.MULTILINE)
+    assert [int(number) for number, _ in steps] == list(range(1, len(steps) + 1))
+    listed = "\n".join(step for _, step in steps)
+    for needed in ("-m venv /opt/driveby", "useradd", "daemon-reload", "/etc/systemd/system/"):
+        assert needed in listed
+    for name in SERVICES:
+        assert f"driveby-{name}" in listed
+        text = " ".join(UNITS[name].read_text().replace("#", " ").split())
+        assert "installation: docs/install.md, Services" in text
+        assert "useradd" not in text
+
+
 def test_installation_places_credentials_where_the_options_expect_them() -> None:
-    installed = UNITS["logger"].read_text()
-    (copied,) = re.findall(r"cp -r (.*) /etc/driveby/tls$", installed, re.MULTILINE)
+    installed = (ROOT / "docs/install.md").read_text()
+    (copied,) = re.findall(r"`cp -r (.*?) /etc/driveby/tls`", installed)
     places = {f"/etc/driveby/tls/{Path(one).name}" for one in copied.split()}
     named = "".join(path.read_text() for path in sorted((ROOT / "deploy").iterdir()))
     assert set(re.findall(r"/etc/driveby/tls/\w+", named)) == places
