@@ -12,7 +12,7 @@ from services.common.geodesy import bridge_frame, to_chainage
 from services.notebook.read import read
 from services.notebook.simulate import simulate
 from services.simulation.drive import paper_site
-from services.simulation.lane import driven_lane
+from services.simulation.lane import driven_lane, twist_of
 
 DECLARED = {"lane_offset_m": 1.5, "torsional_frequency_ratio": 2.0, "deck_gyration_m": 2.3}
 
@@ -59,3 +59,13 @@ def test_simulated_truck_drives_the_declared_lane(tmp_path: Path) -> None:
     np.testing.assert_allclose(series, expected, atol=1e-5)
     stiff = flat.signals.channels["unsprung_front"].acceleration_m_per_s2
     assert np.abs(series - stiff).max() > 1e-3
+
+
+def test_mirrored_lane_twists_the_deck_alike() -> None:
+    """The opposite lane is rehearsed by another road, not by another sign."""
+    bridge = paper_site().bridges[0]
+    left, right = (twist_of(bridge, side, (2.0, 2.3)) for side in (1.5, -1.5))
+    assert left is not None
+    assert right is not None
+    assert left.flexibility_per_n == right.flexibility_per_n > 0.0
+    assert left.wave_speed_m_per_s == right.wave_speed_m_per_s
