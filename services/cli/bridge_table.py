@@ -5,7 +5,7 @@ from datetime import date
 from typing import TYPE_CHECKING, Protocol
 
 from schemas.reasons import LEFT_OUT_TEXTS, BridgeReason
-from schemas.results import BridgeResult, ElementState, Parameter, Thirds, ThirdsState
+from schemas.results import BridgeResult, ElementState, Parameter, Thirds, ThirdsState, Track
 from services.common.language import ENGLISH
 from services.common.naming import count_of, entry_in_name
 from services.identification.comparison import describe_level
@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
+_ENOUGH_RUNS = 5
+"""Runs of a wheel-path group from which their lateral wander is known to a third."""
 _NO_CHANGE = (
     "all crossings are combined here; whether EI changed between them: driveby history, driveby "
     "alarm check"
@@ -124,12 +126,24 @@ def _of_state(state: BridgeResult) -> Iterator[str]:
             f"{100.0 * (low or 0.0):.1f} to {100.0 * (high or 0.0):.1f} %"
         )
     for track in state.tracks:
-        wander = "" if track.wander_m is None else f", lateral wander {track.wander_m:.2f} m"
+        wander = "" if track.wander_m is None else f", lateral wander {_wander(state, track)}"
         yield (
             f"wheel-path group of {track.vehicle}, {track.direction.replace('_', ' ')}{wander}: "
             f"{100.0 * track.common_share:.0f} % of the profile mismatch is common to all runs, "
             "so more runs there average out only the rest"
         )
+
+
+def _wander(state: BridgeResult, track: Track) -> str:
+    """Return the lateral wander of a group, with a caveat if its runs are few.
+
+    A standard deviation of n runs has a relative error of 1/√(2(n − 1)), 35 % for five.
+    """
+    runs = len(state.crossings_used) / len(state.tracks)
+    if runs >= _ENOUGH_RUNS:
+        return f"{track.wander_m:.2f} m"
+    few = f"poorly known from about {count_of(round(runs), 'run')}, partly a usual value"
+    return f"{track.wander_m:.2f} m ({few})"
 
 
 def print_elements(
