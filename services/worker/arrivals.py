@@ -27,6 +27,8 @@ _STALLED_HISTORY_S = 10.0
 """Time in s without an older message after which a history is processed as it is."""
 _LONGEST_HISTORY_S = 60.0
 """Time in s after which a history is processed in any case."""
+_KEPT_BOOTS = 8
+"""Number of the latest boots of a truck of which sequences are remembered."""
 
 
 class TruckMessage(NamedTuple):
@@ -147,6 +149,8 @@ class ArrivalQueue:
             self._leaves[truck] = _Leave(message.received_s, _SILENT_S)
             self._lost.pop(truck, None)
         name = (*truck, message.boot_id)
+        if name not in self._highest:
+            self._forget_boots(truck)
         highest, is_known = self._highest[name], name in self._known
         if not is_known and name not in self._new:
             self._new[name] = _History(message.received_s, highest)
@@ -156,6 +160,13 @@ class ArrivalQueue:
             return [message]
         self._new[name].add(message)
         return []
+
+    def _forget_boots(self, truck: _Vehicle) -> None:
+        """Forget the oldest boots of a truck, of which each start brings one more."""
+        boots = [name for name in self._highest if name[:2] == truck and name not in self._new]
+        for name in boots[: 1 - _KEPT_BOOTS]:
+            del self._highest[name]
+            self._known.discard(name)
 
     def _note_return(self, truck: _Vehicle) -> None:
         """Collect a history of a truck that left and is back, as of a new one."""

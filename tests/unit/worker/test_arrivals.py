@@ -58,6 +58,21 @@ def test_the_first_second_of_a_truck_is_put_in_order_of_time() -> None:
     assert arrivals.add(message(3.0, 1, boot_id=2)) == []  # that boot is new
 
 
+def test_a_truck_that_starts_again_and_again_takes_bounded_memory() -> None:
+    arrivals = ArrivalQueue()
+    for boot_id in range(100):
+        arrivals.add(message(float(2 * boot_id), boot_id=boot_id))
+        arrivals.add(message(float(2 * boot_id), truck="truck-2"))
+        arrivals.due(2.0 * boot_id + 1.0)
+    assert len(arrivals._highest) <= 9
+    assert arrivals._known <= set(arrivals._highest)
+    for boot_id in range(93, 100):
+        late = message(200.0, boot_id=boot_id)
+        assert arrivals.add(late) == [late]
+    other = message(200.0, truck="truck-2")
+    assert arrivals.add(other) == [other]
+
+
 def numbered(at_s: float, number: int) -> TruckMessage:
     return message(at_s, number)._replace(sequence=number)
 
