@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pre_core.constants import NORMAL_975
 from services.viewer.crossing_view import CrossingView
+from services.viewer.element_labels import cut_height
 
 STRIP_WIDTH, STRIP_HEIGHT = 1200, 600
 """Size in pixels: along the span, and for the rigidity."""
@@ -20,11 +21,17 @@ STRIP_WEAK = (230, 159, 0)
 
 
 def strip_top(crossing: CrossingView) -> float:
-    """Return the relative EI at the upper edge: 1.5, or up to 4 for high intervals."""
-    highest = crossing.rigidity_nm2 if crossing.interval_nm2 is None else crossing.interval_nm2
-    if highest is None:
+    """Return the relative EI at the upper edge: 1.5, or up to 4 for high intervals.
+
+    The interval of an unresolved element that is much longer than the others is cut, as in figures.
+    """
+    if crossing.rigidity_nm2 is None:
         return 1.5
-    needed = float((highest.T / crossing.nominal_nm2).max())
+    ratio = crossing.rigidity_nm2 / crossing.nominal_nm2
+    needed = float(ratio.max())
+    if crossing.interval_nm2 is not None:
+        low, high = crossing.interval_nm2.T / crossing.nominal_nm2
+        needed = min(float(high.max()), cut_height(1.0, (ratio, low, high)))
     return min(4.0, max(1.5, math.ceil(2.0 * needed) / 2.0))
 
 

@@ -30,6 +30,9 @@ from services.viewer.strip import (
     strip_top,
 )
 
+_ARROW_PX: Final = 24.0
+"""Height of the tip of an arrow."""
+
 
 def _layout(scene: CrossingScene, _: Floats) -> rrb.Container:
     doubt = "DOUBTFUL: " if scene.crossing.is_doubtful else ""
@@ -102,7 +105,7 @@ def _log_whiskers(
     limits: tuple[Floats, Floats],
     top: float,
 ) -> None:
-    """Draw intervals; one that exceeds the strip has no bar at that end."""
+    """Draw intervals; one that exceeds the strip ends in an arrow."""
     low, high = limits
     rows = np.stack((strip_row(low, top), strip_row(high, top)), axis=1)
     strips = [[(x, bottom), (x, end)] for x, (bottom, end) in zip(across, rows, strict=True)]
@@ -110,6 +113,9 @@ def _log_whiskers(
         inside = limit <= top
         ends = zip(across[inside], tips[inside], row[inside], strict=True)
         strips += [[(x - tip, y), (x + tip, y)] for x, tip, y in ends]
+    beyond = high > top
+    for x, tip in zip(across[beyond], tips[beyond], strict=True):
+        strips.append([(x - tip, _ARROW_PX), (x, 0.0), (x + tip, _ARROW_PX)])
     log_strips(recording, entity, strips, [(255, 255, 255)], 1.0)
 
 

@@ -32,12 +32,12 @@ from services.viewer import rerun_file
 from services.viewer.crossing_scene import CrossingScene, crossing_root
 from services.viewer.crossing_view import CrossingView, front_axle_chainage, view_of_crossing
 from services.viewer.layout import blueprint
-from services.viewer.panels import signals
+from services.viewer.panels import rigidity, signals
 from services.viewer.panels.verdict import verdict_markdown
 from services.viewer.rerun_file import RerunContent, write_rrd
 from services.viewer.rerun_parts import CHAINAGE
 from services.viewer.rerun_places import bridges_near_tracks, bridges_of_site
-from services.viewer.strip import STRIP_HEIGHT, STRIP_WIDTH, rigidity_strip
+from services.viewer.strip import STRIP_HEIGHT, STRIP_WIDTH, rigidity_strip, strip_top
 from services.viewer.vehicle_signals import (
     VehicleSignals,
     acceleration_series,
@@ -383,6 +383,28 @@ def test_chainage_falls_when_the_truck_comes_from_the_other_end(site: Site) -> N
     view = view_of_crossing(crossing(direction="end_to_start"), site.bridges[0])
     times = view.entry_time_s + np.array([0.0, 1.0, 3.0])
     assert front_axle_chainage(view, times) == pytest.approx([30.0, 20.0, 0.0], abs=1e-5)
+
+
+def test_unresolved_element_does_not_squeeze_the_strip(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its interval goes on beyond the upper edge, in an arrow, as in the pictures."""
+    view = view_of_crossing(crossing(), site.bridges[0])
+    assert view.rigidity_nm2 is not None
+    usual = view.rigidity_nm2[:, None] * np.array([0.9, 1.1])
+    wide = usual.copy()
+    wide[0, 1] *= 9.0
+    drawn: list[list[tuple[float, float]]] = []
+    monkeypatch.setattr(rigidity, "log_strips", lambda *given: drawn.extend(given[2]))
+    at = np.arange(float(len(usual)))
+    tops = []
+    for interval, arrows in ((usual, 0), (wide, 1)):
+        drawn.clear()
+        tops.append(strip_top(view._replace(interval_nm2=interval)))
+        low, high = interval.T / view.nominal_nm2
+        rigidity._log_whiskers(None, "a", at, at, (low, high), tops[-1])  # type: ignore[arg-type]
+        assert sum(len(strip) == 3 and strip[1][1] == 0.0 for strip in drawn) == arrows
+    assert tops[1] <= tops[0] + 0.5
 
 
 def test_strip_is_brightest_at_the_estimate(site: Site) -> None:
