@@ -8,14 +8,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pre_core.constants import NORMAL_975
 from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.notebook.arguments import names_of
 from services.notebook.inference import prior_draws
-from services.notebook.residual_size import TREND_DEGREE, expected_std_m
 from services.notebook.solution import Identification, Solution, one_solution
 from services.viewer.drawing import MUTED, STYLE, mark_bridge, simplify_axes
+from services.viewer.residual_size import TREND_DEGREE, expected_reach_m
 
 _BRIDGE: Final = "#e3ebf0"
 _COLUMNS: Final = 4
@@ -49,15 +48,15 @@ def plot_residual(solution: Solution | Identification) -> Figure:
     x_m, bridge = np.asarray(road.x_m), solution.bridge
     difference_mm = 1e3 * (np.asarray(road.front_m) - np.asarray(road.rear_m))
     trend_mm = np.polynomial.Polynomial.fit(x_m, difference_mm, TREND_DEGREE)(x_m)
-    expected_m = expected_std_m(solution.crossing, road, solution.site)
+    reach_m = expected_reach_m(solution.crossing, road, solution.site)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(9.0, 3.3), layout="constrained")
         axes = figure.add_subplot()
         mark_bridge(axes, (0.0, *bridge.interior_supports_m, bridge.span_m))
         axes.patches[0].set(label="bridge", facecolor=_BRIDGE)
         axes.axhline(0.0, color=MUTED, lw=0.8)
-        if expected_m is not None:
-            half_mm = 1e3 * NORMAL_975 * expected_m
+        if reach_m is not None:
+            half_mm = 1e3 * reach_m
             axes.fill_between(
                 x_m,
                 trend_mm - half_mm,

@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
+from pre_core.constants import NORMAL_975, STANDARD_GRAVITY_M_PER_S2
 from schemas.results import CrossingResult, RoadMismatch, RoadResult
 from schemas.site import Site
 from services.common.arrays import Floats
@@ -14,8 +14,10 @@ TREND_DEGREE: Final = 3
 """Degree of the trend that is removed: it takes the drift of twice integrated noise."""
 
 
-def expected_std_m(crossing: CrossingResult, road: RoadResult, site: Site | None) -> Floats | None:
-    """Return the standard deviation (n,) of front_m − rear_m about its cubic trend.
+def expected_reach_m(
+    crossing: CrossingResult, road: RoadResult, site: Site | None
+) -> Floats | None:
+    """Return the half width (n,) of the 95 % band of front_m − rear_m about its cubic trend.
 
     Noise of the axles' accelerometers, white and of the declared density, integrates twice to a
     process with the covariance q (a³/3 + a² |s − t|/2), where a is the earlier of the times s and t
@@ -35,7 +37,7 @@ def expected_std_m(crossing: CrossingResult, road: RoadResult, site: Site | None
     basis, _ = np.linalg.qr(np.vander(x_m - x_m.mean(), TREND_DEGREE + 1))
     remove = np.eye(x_m.size) - basis @ basis.T
     variance = np.einsum("ij,jk,ik->i", remove, covariance, remove, optimize=True)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+    return np.asarray(NORMAL_975 * np.sqrt(np.maximum(variance, 0.0)))
 
 
 def _of_noise(time_s: Floats, density_ug_per_rthz: tuple[float, ...]) -> Floats:
