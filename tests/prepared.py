@@ -43,7 +43,7 @@ IMPORTED = (
     "services.truck.run",
     "services.worker.run",
 )
-_PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
+_PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
 _LARGEST_REQUEST = 100_000
 _MOST_DESCRIPTORS = 64
 _ABOVE_ALL = 500
@@ -129,7 +129,7 @@ def _adopting() -> Iterator[None]:
         _prctl(_PR_SET_CHILD_SUBREAPER, 0)
 
 
-def _prctl(option: int, value: int) -> None:
+def _prctl(option: int, value: int | bytes) -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(option, value, 0, 0, 0):
         raise OSError(ctypes.get_errno(), "prctl")
@@ -277,7 +277,9 @@ def _serve(end: socket.socket) -> NoReturn:
 
 
 def _run(words: list[str]) -> None:
-    """Do what `python WORDS` does."""
+    """Do what `python WORDS` does, by a name in /proc that tells the program."""
+    program = words[1] if words[0] == "-m" else Path(words[0]).name
+    _prctl(_PR_SET_NAME, program.encode())
     main = sys.modules["__main__"] = types.ModuleType("__main__")
     match words:
         case ["-c", code, *_]:

@@ -67,11 +67,15 @@ def test_faults_runs_everything_but_the_soak(project: Path) -> None:
 
 
 def session_of(number: int) -> Iterator[tuple[int, str]]:
-    """Process and program of all that live in a session of processes."""
+    """Process and program of all that live in a session of processes.
+
+    A forked one (`tests.prepared`) has the command line of another, and a name of its own.
+    """
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = stat.read_text().rpartition(")")[2].split()
             program = (stat.parent / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+            program += (stat.parent / "comm").read_text()
         except OSError:
             continue
         if int(fields[3]) == number and fields[0] != "Z":
@@ -101,7 +105,7 @@ def test_what_interrupts_the_tests_ends_their_processes(
         until(
             lambda: (
                 tests.poll() is not None
-                or sum("truck_process.py" in program for _, program in session_of(tests.pid)) >= 3
+                or sum("truck_process" in program for _, program in session_of(tests.pid)) >= 3
             ),
             "three trucks",
         )
