@@ -730,6 +730,7 @@ def test_a_loss_beside_unresolved_elements_may_be_theirs(site: Site) -> None:
     text = reported(site, fused(site, [0.6, 0.4, 0.3, 0.05, 0.1, 0.1, 0.5])).text
     assert "Less stiff near element 4; the exact element is uncertain." in text
     assert "The loss may also be in element 3, which is adjacent." in text
+    assert "Have element 3 (" in text.partition("What to do next")[2]
     assert (
         "Elements 1, 2, 3 and 7 are not resolved (standard deviation above 25 %). "
         f"{ENGLISH.text('rest.resolved', loss=40)} "
