@@ -12,6 +12,7 @@ from services.cli.parser import Subcommand
 from services.cli.parsing import EXIT_SOMETHING_LOST, a_console
 from services.common.errors import InputError
 from services.common.kinds import HISTORY_CSV, HISTORY_JSON, RERUN
+from services.common.language import ENGLISH
 from services.common.naming import count_of
 from services.common.options import (
     file_option,
@@ -257,6 +258,8 @@ def _lines(past: "BridgeHistory") -> Iterator[str]:
         yield alarm_line(alarm)
     for statement in statements(past):
         yield statement.text
+    if past.comparison is not None:
+        yield ENGLISH.text("change.to_state")
 
 
 def _csv(periods: "Sequence[FusedPeriod]") -> Iterator[str]:
