@@ -277,7 +277,7 @@ def _serve(end: socket.socket) -> NoReturn:
 
 
 def _run(words: list[str]) -> None:
-    """Do what `python WORDS` does, by a name in /proc that tells the program."""
+    """Do what `python WORDS` does, named in /proc after the program."""
     program = words[1] if words[0] == "-m" else Path(words[0]).name
     _prctl(_PR_SET_NAME, program.encode())
     main = sys.modules["__main__"] = types.ModuleType("__main__")
