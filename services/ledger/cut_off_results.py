@@ -13,9 +13,10 @@ from typing import Final
 
 from services.common.errors import FailureError, InputError
 from services.common.files import sync
+from services.common.naming import count_of
 from services.ledger.worker_results import files_of_workers
 from services.recordings.recording import is_being_written, is_closed
-from services.recordings.recovery import describe, put_aside, recover_recording
+from services.recordings.recovery import put_aside, recover_recording
 
 _log = logging.getLogger(__name__)
 _INCOMPLETE: Final = re.compile(
@@ -57,4 +58,8 @@ def _complete(path: Path) -> None:
     os.utime(complete, ns=(times.st_atime_ns, times.st_mtime_ns))  # earlier runs expire by age
     complete.replace(path)
     sync(path.parent)
-    _log.info("%s: its worker was killed; %s", path, describe(recovery))
+    # How many messages were lost does not matter: what has no result is identified again.
+    kept = f"{count_of(recovery.messages, 'message')} kept"
+    _log.info(
+        "%s: its worker was killed; %s; crossings without a result are identified again", path, kept
+    )

@@ -37,6 +37,9 @@ def test_a_recording_that_was_cut_off_gets_its_end(
     assert is_closed(second)
     lines = [r.getMessage() for r in caplog.records if "its worker was killed" in r.getMessage()]
     assert [line.partition(":")[0] for line in lines] == [str(first), str(second)]
+    # Nobody need fear for what was in work: it has no result, so it is identified again.
+    assert all("without a result are identified again" in line for line in lines)
+    assert not any("lost" in line for line in lines)
     assert [message.sequence for message in read_messages(first)] == there
     assert read_earlier(tmp_path, REALM, NOW_S, SEARCH) == as_it_was
     assert first.stat().st_mtime == NOW_S
