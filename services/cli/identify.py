@@ -353,7 +353,8 @@ def _support_lines(derived: Derived, *, torsion_declared: bool) -> Iterator[str]
     """Describe the probabilities of what may be absent, and the suspension's weight."""
 
     def at_ends(likely: AtEnds) -> str:
-        return f"{100.0 * likely.start:.0f} % at the start, {100.0 * likely.end:.0f} % at the end"
+        at_start, at_end = 100.0 * likely.start, 100.0 * likely.end
+        return f"{at_start:.0f} % at the start, {at_end:.0f} % at the end (50 %: not determined)"
 
     if derived.probability_sprung is not None:
         yield f"probability of rotational restraint: {at_ends(derived.probability_sprung)}"
@@ -363,7 +364,7 @@ def _support_lines(derived: Derived, *, torsion_declared: bool) -> Iterator[str]
         yield "the deck twists under the truck: declared, the lane is off the axis"
     elif derived.probability_torsion:
         likely = f"{100.0 * derived.probability_torsion:.0f} %"
-        yield f"probability that the deck twists under the truck: {likely}"
+        yield f"probability that the deck twists under the truck: {likely} (50 %: not determined)"
     if derived.springs_believed is not None:
         yield f"weight of the suspension equations: {100.0 * derived.springs_believed:.0f} %"
 
