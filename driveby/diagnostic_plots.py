@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 
 from services.common.arrays import Floats
 from services.common.errors import InputError
-from services.notebook.arguments import names_of
-from services.notebook.inference import prior_draws
+from services.notebook.arguments import names_of, wrong
+from services.notebook.inference import prior_density, prior_draws
+from services.notebook.simulate import Simulation
 from services.notebook.solution import Identification, Solution, one_solution
 from services.viewer.drawing import MUTED, STYLE, mark_bridge, simplify_axes
 from services.viewer.residual_size import TREND_DEGREE, expected_reach_m
@@ -24,7 +25,9 @@ _BELOW_ZERO: Final = 0.04
 """Part of the axis below zero for a parameter that is never negative."""
 _VISIBLE: Final = 0.2
 """Height of a density over its maximum from which it is seen."""
-_BINS: Final = 60
+_BINS: Final = 40
+_POINTS: Final = 400
+"""Number of points of a prior's curve."""
 _SHOWN: Final = 6.0
 """Posterior standard deviations on either side of the mean that are drawn."""
 _POSTERIOR_OPACITY: Final = 0.6
@@ -97,16 +100,23 @@ def _rms(values: Floats) -> float:
 
 
 def plot_posterior(
-    solution: Solution | Identification, names: Sequence[str] | None = None
+    solution: Solution | Identification,
+    names: Sequence[str] | None = None,
+    *,
+    truth: Simulation | None = None,
 ) -> Figure:
     """Draw prior and posterior density of parameters, by default of all EI, with 95 % intervals.
 
     Each density is relative to its own maximum: a wide prior would be a flat line next to a narrow
-    posterior. The axis reaches the prior where the posterior is far from it.
+    posterior. The axis reaches the prior where the posterior is far from it. `truth`, of a
+    simulated crossing, draws the true EI.
 
     Raise InputError for an unknown name or a crossing without draws.
     """
+    if truth is not None and not isinstance(truth, Simulation):
+        raise wrong("truth", truth, "what simulate() returns")
     solution = one_solution("solution", solution, "plot_posterior")
+    true_ei = {} if truth is None else _true_rigidities(solution, truth)
     with matplotlib.rc_context(STYLE):
         figure, panels = _panels(_chosen(solution, names), 2.0)
         for name, axes in panels:
@@ -119,9 +129,11 @@ def plot_posterior(
                 limits = np.percentile(prior, _CUT)
                 if found.prior.distribution == "half_normal":
                     limits[0] = 0.0
-                heights, edges = _density(prior, limits)
-                axes.stairs(heights, edges, fill=True, color=_PRIOR, label="prior")
-                window = _reaching(window, prior, heights, edges)
+                at = np.linspace(*limits, _POINTS)
+                heights = prior_density(found.prior, at * divisor)
+                heights /= heights.max()
+                axes.fill_between(at, heights, color=_PRIOR, lw=0.0, label="prior")
+                window = _reaching(window, prior, heights, at)
                 if found.prior.distribution in ("half_normal", "log_normal"):
                     window[0] = max(window[0], -_BELOW_ZERO * window[1])
             heights, edges = _density(draws, np.array([draws.min(), draws.max()]))
@@ -130,14 +142,25 @@ def plot_posterior(
             )
             for limit in (found.q025, found.q975):
                 axes.axvline(limit / divisor, color="0.3", lw=0.8, ls="--")
+            if name in true_ei:
+                true = true_ei[name] / divisor
+                axes.axvline(true, color="C3", lw=1.2, label="truth")
+                window = np.array([min(window[0], true), max(window[1], true)])
             axes.set_xlim(*window)
             axes.set_ylim(0.0, 1.08)
             axes.set_xlabel(unit)
             axes.set_yticks([])
         figure.supylabel("density over its maximum", fontsize="medium")
         handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=2)
+        figure.legend(handles, labels, loc="outside lower center", ncols=3)
     return figure
+
+
+def _true_rigidities(solution: Solution, truth: Simulation) -> dict[str, float]:
+    """Return the true EI of each element in N·m², by name."""
+    nominal = solution.bridge.nominal_flexural_rigidity_nm2
+    pairs = zip(nominal, truth.ei_ratios.tolist(), strict=True)
+    return {f"EI_{number}": ei * ratio for number, (ei, ratio) in enumerate(pairs, 1)}
 
 
 def _density(draws: Floats, limits: Floats) -> tuple[Floats, Floats]:
@@ -146,9 +169,9 @@ def _density(draws: Floats, limits: Floats) -> tuple[Floats, Floats]:
     return counts / max(counts.max(), 1), edges
 
 
-def _reaching(window: Floats, prior: Floats, heights: Floats, edges: Floats) -> Floats:
+def _reaching(window: Floats, prior: Floats, heights: Floats, at: Floats) -> Floats:
     """Return a window that reaches the middle half of a prior, unless it shows the prior anyway."""
-    is_inside = (edges[1:] > window[0]) & (edges[:-1] < window[1])
+    is_inside = (at >= window[0]) & (at <= window[1])
     if heights[is_inside].max(initial=0.0) >= _VISIBLE:
         return window
     low, high = np.percentile(prior, (25.0, 75.0))
@@ -157,6 +180,8 @@ def _reaching(window: Floats, prior: Floats, heights: Floats, edges: Floats) -> 
 
 def plot_chains(solution: Solution | Identification, names: Sequence[str] | None = None) -> Figure:
     """Draw the draws of parameters in their order, by default of all EI, a line for each chain.
+
+    The title gives the crossing's largest R-hat and smallest effective sample size.
 
     Raise InputError for an unknown name or a crossing without draws.
     """
@@ -169,7 +194,18 @@ def plot_chains(solution: Solution | Identification, names: Sequence[str] | None
                 axes.plot(chain / divisor, lw=0.4, alpha=0.7)
             axes.set_xlabel("draw")
             axes.set_ylabel(unit)
+        figure.suptitle(_convergence(solution), fontsize="medium")
     return figure
+
+
+def _convergence(solution: Solution) -> str:
+    """Return the diagnostics of a crossing's draws in words."""
+    of = solution.crossing.diagnostics
+    drawn = next(iter(solution.draws.values())).size
+    return (
+        f"of all parameters: largest R-hat {of['r_hat']:.3f}, smallest effective sample size "
+        f"{of['ess']:.0f} of {drawn} draws"
+    )
 
 
 def _shown_unit(value: float, unit: str) -> tuple[float, str]:

@@ -38,6 +38,19 @@ def prior_draws(prior: Prior) -> Floats:
     return _drawn(prior, np.random.default_rng(_SEED))
 
 
+def prior_density(prior: Prior, values: Floats) -> Floats:
+    """Return the density of a prior at values (n,), up to a constant factor."""
+    if prior.distribution == "uniform":
+        return (np.abs(values - prior.location) <= prior.scale).astype(np.float64)
+    if prior.distribution == "log_normal":
+        positive = np.maximum(values, np.finfo(np.float64).tiny)
+        z = np.log(positive / prior.location) / prior.scale
+        return np.asarray(np.where(values > 0.0, np.exp(-0.5 * z**2) / positive, 0.0))
+    density = np.exp(-0.5 * ((values - prior.location) / prior.scale) ** 2)
+    is_possible = prior.distribution != "half_normal" or values >= prior.location
+    return np.asarray(np.where(is_possible, density, 0.0))
+
+
 def _drawn(prior: Prior, rng: np.random.Generator) -> Floats:
     """Return draws (n,) of a prior."""
     if prior.distribution == "uniform":

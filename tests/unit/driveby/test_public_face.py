@@ -19,6 +19,7 @@ from schemas.results import (
     CrossingResult,
     ElementState,
     Parameter,
+    Prior,
     ResultHeader,
     Results,
     results,
@@ -31,6 +32,7 @@ from services.common import extras
 from services.common.extras import install_command
 from services.common.field_docs import with_field_docs
 from services.notebook import identify as identifying
+from services.notebook import inference
 from services.notebook import simulate as simulating
 from services.recordings.recording import read_messages
 from services.recordings.writer import write_recording
@@ -931,10 +933,22 @@ def test_simulate_recording_takes_the_options_of_the_command(
 
 def prior_seen(axes: Any) -> float:
     """Return the largest height of the prior within the axis, over that of the panel."""
-    heights, edges, _ = axes.patches[0].get_data()
+    at, heights = axes.collections[0].get_paths()[0].vertices.T
     low, high = axes.get_xlim()
-    is_inside = (edges[1:] > low) & (edges[:-1] < high)
+    is_inside = (at >= low) & (at <= high)
     return float(heights[is_inside].max(initial=0.0) / axes.get_ylim()[1])
+
+
+@pytest.mark.parametrize("distribution", ["log_normal", "half_normal", "normal", "uniform"])
+def test_density_of_a_prior_is_that_of_its_draws(distribution: Any) -> None:
+    prior = Prior(distribution=distribution, location=2.0, scale=0.5)
+    at = np.linspace(-1.0, 8.0, 9001)
+    density = inference.prior_density(prior, at)
+    share = np.cumsum(density) / density.sum()
+    draws = inference.prior_draws(prior)
+    for probability in (0.1, 0.5, 0.9):
+        below = np.mean(draws <= at[np.searchsorted(share, probability)])
+        assert below == pytest.approx(probability, abs=0.03)  # 2000 draws: 0.011 at 0.5
 
 
 def test_prior_far_from_the_posterior_is_in_the_plot(found: driveby.Identification) -> None:
@@ -974,7 +988,9 @@ def test_residual_has_a_band_of_its_expected_size(found: driveby.Identification)
     assert (len(alone.collections) == 1) == (road.mismatch is not None)
 
 
-def test_diagnostic_plots_have_a_panel_for_each_parameter(found: driveby.Identification) -> None:
+def test_diagnostic_plots_have_a_panel_for_each_parameter(
+    found: driveby.Identification, simulation: driveby.Simulation
+) -> None:
     (solution,) = found.solutions
     (residual,) = driveby.plot_residual(solution).axes
     road = solution.crossing.road
@@ -997,7 +1013,7 @@ def test_diagnostic_plots_have_a_panel_for_each_parameter(found: driveby.Identif
     assert {axes.get_xlabel() for axes in posterior} == {"GN·m²"}
     low_gn, high_gn = posterior[3].get_xlim()
     assert len(posterior) == solution.bridge.elements
-    prior, above = posterior[0].patches
+    (prior,), (above,) = posterior[0].collections, posterior[0].patches
     assert prior.get_zorder() <= above.get_zorder()
     assert above.get_alpha() < 0.9  # the prior behind it shows
     for name in ("beta", "EI_4", "rhoA"):
@@ -1007,9 +1023,21 @@ def test_diagnostic_plots_have_a_panel_for_each_parameter(found: driveby.Identif
     chains = driveby.plot_chains(solution, ["rhoA", "EI_4"]).axes
     assert [axes.get_title(loc="left") for axes in chains] == ["rhoA", "EI_4"]
     assert len(chains[0].lines) == len(solution.draws["rhoA"])
+    title = chains[0].get_figure().get_suptitle()
+    assert f"largest R-hat {solution.crossing.diagnostics['r_hat']:.3f}" in title
     (alone,) = driveby.plot_posterior(found, names="rhoA").axes
     assert alone.get_title(loc="left") == "rhoA"
     with pytest.raises(driveby.InputError, match="EI_9: is unknown"):
         driveby.plot_posterior(solution, ["EI_9"])
+    # The sample is not of this simulation: its truth is far away, and in the picture all the same.
+    (with_truth,) = driveby.plot_posterior(solution, ["EI_4"], truth=simulation).axes
+    ratio, nominal = simulation.ei_ratios[3], solution.bridge.nominal_flexural_rigidity_nm2[3]
+    (drawn_at,) = (line for line in with_truth.lines if line.get_label() == "truth")
+    assert drawn_at.get_xdata()[0] == pytest.approx(1e-9 * ratio * nominal)
+    assert with_truth.get_xlim()[0] <= drawn_at.get_xdata()[0] <= with_truth.get_xlim()[1]
+    with pytest.raises(
+        driveby.InputError, match=r"truth is 3, it must be what simulate\(\) returns"
+    ):
+        driveby.plot_posterior(solution, truth=3)  # type: ignore[arg-type]
     with pytest.raises(driveby.InputError, match=r"names is \[5\], it must be a list of names"):
         driveby.plot_posterior(solution, [5])  # type: ignore[list-item]

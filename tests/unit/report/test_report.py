@@ -916,7 +916,10 @@ def test_of_a_rejected_crossing_stands_what_to_do_next(site: Site) -> None:
     ("prior", "words"),
     [
         ("log_normal", "torsion declared the lane is off the axis, so the deck twists"),
-        ("half_normal", "torsion 100 % probability that the deck twists under this lane; 50 %: not determined"),
+        (
+            "half_normal",
+            "torsion 100 % probability that the deck twists under this lane; 50 %: not determined",
+        ),
     ],
 )
 def test_declared_torsion_is_no_probability(site: Site, prior: str, words: str) -> None:
