@@ -13,6 +13,7 @@ from services.viewer.history_figure import (
     HistoryView,
     draw_history,
     history_view,
+    low_references,
     reference_sentence,
 )
 
@@ -41,7 +42,7 @@ def history_section(past: BridgeHistory, prefix: str, language: Language = ENGLI
         last=utc_day(past.periods[-1].end_s - 1.0),
     )
     label = language.text("history.figure", summary=wording)
-    reference = reference_sentence(drawn, language)
+    reference = ". ".join((reference_sentence(drawn, language), *low_references(drawn, language)))
     how = language.text("history.how", unit=language.text(past.unit), reference=reference)
     return tag(
         "section",

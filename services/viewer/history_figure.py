@@ -42,6 +42,8 @@ _LINE_CHARACTERS = 105
 """Maximum length of a line of a sentence."""
 _MAX_PER_CENT = 400.0
 """Upper end of the axes; an interval beyond it means that the element is unresolved."""
+_LOW = 0.75
+"""Share of the elements' median EI below which a reference is suspected to have a loss already."""
 _LEAST_DAYS = {"day": 3.0, "week": 7.0, "month": 31.0}
 """Minimum time shown before the first and after the last middle of a period: all of it, at least.
 
@@ -211,6 +213,7 @@ def _heading(history: HistoryView, language: Language) -> list[tuple[str, str]]:
     lines = [(language.choice("history.figure_bars", many, unit=unit), MUTED)]
     if history.points:
         lines.append((reference_sentence(history, language), MUTED))
+        lines += [(text, INK) for text in low_references(history, language)]
     for mark in history.marks:
         if not mark.acknowledged:
             wording = language.text("history.figure_alarm", alarm=mark.sentence)
@@ -234,6 +237,20 @@ def reference_sentence(history: HistoryView, language: Language) -> str:
     reference = history.reference(0)
     unit = language.text(history.unit)
     return language.text(f"history.reference.{reference.kind}", name=reference.name, unit=unit)
+
+
+def low_references(history: HistoryView, language: Language) -> list[str]:
+    """Return a sentence on elements that were weak before the first period, or none.
+
+    A loss before the reference is no change since.
+    """
+    rigidity = np.array([history.reference(n).ei_nm2 for n in range(len(history.points[-1].mean))])
+    is_low = rigidity < _LOW * np.median(rigidity)
+    names = [f"EI_{n + 1}" for n in np.flatnonzero(is_low)]
+    if not names:
+        return []
+    share = 100.0 * _LOW
+    return [language.text("history.low_reference", elements=language.listed(names), share=share)]
 
 
 def _short(text: str) -> str:

@@ -77,6 +77,17 @@ def test_reference_is_the_first_good_period_of_the_same_elements() -> None:
     assert history._replace(points=doubtful).reference(1).ei_nm2 == 16e9
 
 
+def test_element_that_was_weak_from_the_beginning_is_named() -> None:
+    low = weeks(0.5, 0.5)
+    sentence = (
+        "EI_2: less than 75 % of the median of the elements already then; a loss by then is no "
+        "change here"
+    )
+    for points, is_named in ((low, True), (weeks(0.9, 0.5), False)):
+        texts = [text.get_text() for text in drawn(HistoryView("b", "week", points, (), ())).texts]
+        assert (sentence in texts) is is_named
+
+
 def test_baseline_is_the_reference_if_its_elements_are_those() -> None:
     baseline = StoredBaseline("then.json", (16e9, 20e9))
     history = HistoryView("b-1", "week", weeks(1.0, 0.8), (), (), baseline)
