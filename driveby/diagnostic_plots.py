@@ -129,7 +129,7 @@ def plot_posterior(
                 limits = np.percentile(prior, _CUT)
                 if found.prior.distribution == "half_normal":
                     limits[0] = 0.0
-                at = np.linspace(*limits, _POINTS)
+                at = np.linspace(limits[0], limits[1], _POINTS)
                 heights = prior_density(found.prior, at * divisor)
                 heights /= heights.max()
                 axes.fill_between(at, heights, color=_PRIOR, lw=0.0, label="prior")
