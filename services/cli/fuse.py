@@ -1,10 +1,10 @@
 """The command `driveby fuse`: one estimate of each bridge from stored results."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from schemas.results import BridgeResult, Results, load_results, results_json
+from schemas.results import Results, load_results, results_json
 from schemas.site_file import load_site
 from services.cli.bridge_table import print_bridge
 from services.cli.identify import print_validation, warn_of_baselines
@@ -19,8 +19,7 @@ from services.history.validation_files import (
     pairs_with_intervals,
     pairs_without_validation,
 )
-from services.identification.comparison import RealmsOfBridges
-from services.ledger.baselines import baselines_of, realms_of_baselines, realms_of_bridges
+from services.ledger.baselines import Baselines, baselines_of, realms_of_bridges
 from services.ledger.site_of_results import site_of_results
 
 if TYPE_CHECKING:
@@ -52,7 +51,7 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
         fused = fuse_crossings(
             str(paths[0]),
             found,
-            None if stored is None else (stored.name, stored.bridges),
+            None if stored is None else (stored.name, stored.baselines.states),
             report,
             fuse_suspect=asked.fuse_suspect,
         )
@@ -66,31 +65,30 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
     _print_validations(console, newest, fused.results, asked)
     if stored is not None:
         now = realms_of_bridges(found.crossings)
-        warn_of_baselines(fused.results.bridges, stored.bridges, now, stored.realms)
+        warn_of_baselines(fused.results.bridges, now, stored.baselines)
     if json_path is not None:
         write_atomically(json_path, results_json(fused.results))
     return 0
 
 
-class _Baselines(NamedTuple):
-    """States to compare with, by bridge, and the name of their file."""
+class _NamedBaselines(NamedTuple):
+    """Baselines and the name of their file."""
 
     name: str
-    bridges: Mapping[str, BridgeResult]
-    realms: RealmsOfBridges
+    baselines: Baselines
 
 
-def _baselines(given: Path | None, site: Path | None) -> _Baselines | None:
+def _baselines(given: Path | None, site: Path | None) -> _NamedBaselines | None:
     """Return the states to compare with: as given, else as the site file names."""
     if given is not None:
         before = load_results(given)
-        return _Baselines(str(given), before.bridges, realms_of_bridges(before.crossings))
+        realms = realms_of_bridges(before.crossings)
+        return _NamedBaselines(str(given), Baselines(before.bridges, realms))
     if site is None:
         return None
     known = load_site(site)
     named = baselines_of(known, site.parent)
-    realms = realms_of_baselines(known, site.parent)
-    return _Baselines(str(site), named, realms) if named else None
+    return _NamedBaselines(str(site), named) if named.states else None
 
 
 def _print_validations(

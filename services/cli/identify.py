@@ -56,7 +56,7 @@ from services.history.validation_files import (
 from services.identification.bridge_state import FusionSettings
 from services.identification.comparison import RealmsOfBridges, baseline_cautions
 from services.identification.methods import lacks_noise
-from services.ledger.baselines import baselines_of, realms_of_baselines, realms_of_bridges
+from services.ledger.baselines import Baselines, baselines_of, realms_of_bridges
 from services.recordings.recording import read_messages
 from services.recordings.remote import Source, all_fetched, is_folder_of_recordings
 
@@ -88,12 +88,8 @@ def identify_command(
         found = _found(request, draws, executing, console)
         _print(console, found, known)
         print_validation(console, found, known, validations_folder(asked.validations))
-        warn_of_baselines(
-            found.bridges,
-            request.fusing.baselines,
-            realms_of_bridges(found.crossings),
-            request.baseline_realms,
-        )
+        now = realms_of_bridges(found.crossings)
+        warn_of_baselines(found.bridges, now, request.baselines)
         if asked.json is not None:
             write_atomically(asked.json, results_json(found))
         if asked.rrd is not None:
@@ -156,19 +152,19 @@ class _IdentifyRequest(NamedTuple):
     settings: IdentificationSettings
     fusing: FusionSettings
     certificates: Mapping[VehicleBridgePair, str]
-    baseline_realms: RealmsOfBridges
+    baselines: Baselines
 
 
 def _request(asked: IdentifyOptions, files: list[Path]) -> _IdentifyRequest:
     site = site_of(files, asked.site)
     beside = None if asked.site is None else asked.site.parent
-    fusing = FusionSettings(baselines_of(site, beside, asked.baseline), asked.fuse_suspect)
+    baselines = baselines_of(site, beside, asked.baseline)
+    fusing = FusionSettings(baselines.states, asked.fuse_suspect)
     method, seed = asked.search_method, asked.seed
     settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
     warn_of_no_noise(site, method)
     records = passed_validations(validations_folder(asked.validations), site, settings)
-    realms = realms_of_baselines(site, beside, asked.baseline)
-    return _IdentifyRequest(files, site, settings, fusing, records, realms)
+    return _IdentifyRequest(files, site, settings, fusing, records, baselines)
 
 
 def _found(
@@ -209,13 +205,13 @@ def warn_of_no_noise(site: Site, method: str) -> None:
 
 
 def warn_of_baselines(
-    states: Mapping[str, BridgeResult],
-    baselines: Mapping[str, BridgeResult],
-    now: RealmsOfBridges,
-    then: RealmsOfBridges,
+    states: Mapping[str, BridgeResult], realms: RealmsOfBridges, baselines: Baselines
 ) -> None:
-    """Warn where a bridge is compared with a misleading baseline, as `baseline_cautions`."""
-    for line in baseline_cautions(states, baselines, now, then):
+    """Warn where a bridge is compared with a misleading baseline, as `baseline_cautions`.
+
+    `realms` are those of the crossings of the states.
+    """
+    for line in baseline_cautions(states, baselines.states, realms, baselines.realms):
         _log.warning("%s", line)
 
 

@@ -37,7 +37,7 @@ from services.history.validation_files import (
     passed_validations,
 )
 from services.identification.bridge_state import FusionSettings, with_common_shares
-from services.ledger.baselines import baselines_of, realms_of_baselines, realms_of_bridges
+from services.ledger.baselines import baselines_of, realms_of_bridges
 from services.recordings.remote import (
     Recording,
     RemoteRecording,
@@ -76,7 +76,8 @@ def archive_command(
         {"method": options.search_method, "seed": options.seed}
     )
     warn_of_no_noise(known, options.search_method)
-    fusing = FusionSettings(baselines_of(known, beside, options.baseline), options.fuse_suspect)
+    baselines = baselines_of(known, beside, options.baseline)
+    fusing = FusionSettings(baselines.states, options.fuse_suspect)
     validated = passed_validations(folder, known, settings)
     asked = ArchiveJob(tuple(recordings), known, settings, fusing, validated)
     crossings: list[CrossingResult] = []
@@ -99,8 +100,7 @@ def archive_command(
             on_result=take,
             report=lambda number: bar.update(task, description=count_of(number, "crossing")),
         )
-    of_baselines = realms_of_baselines(known, beside, options.baseline)
-    warn_of_baselines(found.bridges, asked.fusing.baselines, realms, of_baselines)
+    warn_of_baselines(found.bridges, realms, baselines)
     header = asked.header
     _write(into / BRIDGES, header, [], found)
     if json_path is not None:

@@ -3,8 +3,9 @@
 import logging
 from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
-from schemas.results import BridgeResult, CrossingResult, load_results
+from schemas.results import BridgeResult, CrossingResult, Results, load_results
 from schemas.site import Bridge, Site
 from services.common.errors import InputError
 from services.common.outputs import add_input
@@ -12,24 +13,34 @@ from services.common.outputs import add_input
 _log = logging.getLogger(__name__)
 
 
-def baselines_of(
-    site: Site, beside: Path | None, given: Path | None = None
-) -> dict[str, BridgeResult]:
-    """Return the states, by bridge, of a given results file, or of the files that the site names.
+class Baselines(NamedTuple):
+    """States to compare with, and the realms of their crossings, by bridge.
+
+    Crossings that a file of states alone does not contain have no realm.
+    """
+
+    states: dict[str, BridgeResult]
+    realms: dict[str, set[str]]
+
+
+def baselines_of(site: Site, beside: Path | None, given: Path | None = None) -> Baselines:
+    """Return the baselines from a given results file, or from the files that the site names.
 
     A name in a site file is a path relative to the folder `beside` it. A site file that a recording
     carries has no folder (None); its baselines may be absent, which is a warning.
 
     Raise InputError if a file is no results file or has no state of the bridge.
     """
+    found = Baselines({}, {})
     if given is not None:
-        there = load_results(given).bridges
-        found = {b.id: stored_state(given, b) for b in site.bridges if b.id in there}
-        if not found:
+        stored = _read(given)
+        for bridge in site.bridges:
+            if bridge.id in stored.bridges:
+                _take(found, given, stored, bridge)
+        if not found.states:
             names = ", ".join(bridge.id for bridge in site.bridges)
             raise InputError(f"{given}: has no state of {names} to compare with")
         return found
-    out = {}
     for bridge in site.bridges:
         if bridge.baseline is None:
             continue
@@ -37,8 +48,8 @@ def baselines_of(
         if beside is None and not path.is_file():
             _log.warning("the baseline %s of %s is missing; see --baseline", path, bridge.id)
             continue
-        out[bridge.id] = stored_state(path, bridge)
-    return out
+        _take(found, path, _read(path), bridge)
+    return found
 
 
 def realms_of_bridges(crossings: Iterable[CrossingResult]) -> dict[str, set[str]]:
@@ -50,28 +61,24 @@ def realms_of_bridges(crossings: Iterable[CrossingResult]) -> dict[str, set[str]
     return found
 
 
-def realms_of_baselines(
-    site: Site | None, beside: Path | None, given: Path | None = None
-) -> dict[str, set[str]]:
-    """Return the realms of the crossings in the baselines, by bridge; chosen as in `baselines_of`.
-
-    Crossings that a file of states alone does not contain have no realm.
-    """
-    if given is not None:
-        return realms_of_bridges(load_results(given).crossings)
-    out = {}
-    for bridge in () if site is None else site.bridges:
-        path = None if bridge.baseline is None else (beside or Path()) / bridge.baseline
-        if path is not None and path.is_file():
-            realms = realms_of_bridges(load_results(path).crossings)
-            out[bridge.id] = realms.get(bridge.id, set())
-    return out
-
-
 def stored_state(path: Path, bridge: Bridge) -> BridgeResult:
     """Return a bridge's state from a results file; InputError if it has none with its elements."""
-    add_input(path)
-    state = load_results(path).bridges.get(bridge.id)
+    return _state_in(path, _read(path), bridge)
+
+
+def _read(path: Path) -> Results:
+    add_input(path)  # first: the results to be written must not replace it, whatever it holds
+    return load_results(path)
+
+
+def _take(found: Baselines, path: Path, stored: Results, bridge: Bridge) -> None:
+    """Add the baseline of one bridge from a results file."""
+    found.states[bridge.id] = _state_in(path, stored, bridge)
+    found.realms[bridge.id] = realms_of_bridges(stored.crossings).get(bridge.id, set())
+
+
+def _state_in(path: Path, stored: Results, bridge: Bridge) -> BridgeResult:
+    state = stored.bridges.get(bridge.id)
     if state is None or len(state.elements) != bridge.elements:
         raise InputError(
             f"{path}: has no state of {bridge.id} with {bridge.elements} elements to compare with"

@@ -58,7 +58,7 @@ class SiteReload(NamedTuple):
         if backfill is not None:
             backfill.retarget(edited.site)
         _log.info("%s was edited: %s applies now, results in %s", first.path, edited.hash, path)
-        fusing = first.fusing._replace(baselines=edited.baselines)
+        fusing = first.fusing._replace(baselines=edited.baselines.states)
         yield from service.engine.retarget(edited.site, header, fusing, found)
 
 

@@ -31,12 +31,11 @@ from services.execution.offline import header_of
 from services.execution.processes import ProcessExecutor
 from services.history.validation_files import passed_validations
 from services.identification.bridge_state import FusionSettings
-from services.identification.comparison import origin_caution
 from services.identification.engine import Engine
 from services.identification.known import search_hash
 from services.identification.methods import METHODS
 from services.identification.waiting import Validations
-from services.ledger.baselines import baselines_of, realms_of_baselines
+from services.ledger.baselines import baselines_of
 from services.ledger.crossing_log import Ledger
 from services.ledger.cut_off_results import recover_cut_off_results
 from services.ledger.runs import (
@@ -52,7 +51,7 @@ from services.worker.receiving import MessageReceiver
 from services.worker.recording_list import BackfillSource
 from services.worker.service import Search, WorkerService, publish_progress
 from services.worker.settings import WorkerSettings
-from services.worker.site_file_watcher import SiteFileWatcher
+from services.worker.site_file_watcher import SiteFileWatcher, warn_of_simulated
 from services.worker.validation_runner import ValidationRunner
 
 _log = logging.getLogger(__name__)
@@ -83,7 +82,7 @@ def run(asked: WorkerSettings, ready: Callable[[], None] | None = None) -> int:
 def _run(asked: WorkerSettings, search: Search, ready: Callable[[], None] | None) -> int:
     file = asked.file or free_results_path(asked.folder / asked.realm)
     # A file of its own has room for one site file.
-    watch = SiteFileWatcher(asked.site, search.site) if asked.file is None else None
+    watch = SiteFileWatcher(asked.site, search.site, asked.realm) if asked.file is None else None
     earlier = _earlier_runs(asked, search)
     _check_writable(asked, file, search.certificates)
     ledger = Ledger(earlier.crossings, time.time())
@@ -170,11 +169,9 @@ def _search(asked: WorkerSettings) -> Search:
     site = parse_site(text, str(asked.site))
     settings = IdentificationSettings.model_validate({"method": asked.search_method})
     header = header_of(site, settings, time.time())
-    fusing = FusionSettings(baselines_of(site, asked.site.parent), threads=settings.threads)
-    for name, realms in realms_of_baselines(site, asked.site.parent).items():
-        caution = origin_caution([asked.realm], realms)
-        if caution is not None:
-            _log.warning("%s: %s", name, caution)
+    baselines = baselines_of(site, asked.site.parent)
+    warn_of_simulated(asked.realm, baselines)
+    fusing = FusionSettings(baselines.states, threads=settings.threads)
     certificates = asked.certificates or asked.folder / "certificates"
     return Search(asked.site, text, site, settings, header, fusing, certificates)
 

@@ -4,11 +4,11 @@ import logging
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from schemas.results import BridgeResult
 from schemas.site import Site
 from schemas.site_file import parse_site, read_site_text, site_hash
 from services.common.errors import InputError
-from services.ledger.baselines import baselines_of
+from services.identification.comparison import origin_caution
+from services.ledger.baselines import Baselines, baselines_of
 
 _log = logging.getLogger(__name__)
 CHECK_EVERY_S: Final = 2.0
@@ -22,14 +22,23 @@ class EditedSite(NamedTuple):
     text: str
     site: Site
     hash: str
-    baselines: dict[str, BridgeResult]
+    baselines: Baselines
+
+
+def warn_of_simulated(realm: str, baselines: Baselines) -> None:
+    """Warn of each bridge of which only one, the realm or the baseline, is simulated."""
+    for bridge, realms in baselines.realms.items():
+        caution = origin_caution([realm], realms)
+        if caution is not None:
+            _log.warning("%s: %s", bridge, caution)
 
 
 class SiteFileWatcher:
     """Watcher of the site file, which reports each error once."""
 
-    def __init__(self, path: Path, site: Site) -> None:
+    def __init__(self, path: Path, site: Site, realm: str) -> None:
         self._path = path
+        self._realm = realm
         self._hash = site_hash(site)
         self._seen = self._signature()
         self._refused = ""
@@ -61,6 +70,7 @@ class SiteFileWatcher:
         if (found := site_hash(site)) == self._hash:
             return None
         self._hash = found
+        warn_of_simulated(self._realm, baselines)
         return EditedSite(text, site, found, baselines)
 
     def _signature(self) -> _Signature | None:
