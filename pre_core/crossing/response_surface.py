@@ -161,10 +161,19 @@ def _fit_parabolas(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the `parabolas` of values at points u (k, n).
 
-    `values_at` returns those (m, …) of some points, so that not all are in memory.
+    `values_at` returns those (m, …) of some points, so that not all are in memory. Points without a
+    finite value do not count: so far away, a truck may never reach the bridge.
     """
+
+    def sums(some: slice) -> ParabolaSums:
+        at, values = u[some], values_at(some)
+        is_possible = np.isfinite(values).all(axis=0)
+        if not is_possible.all():
+            at, values = at[is_possible], values[:, is_possible]
+        return sums_of(at, values)
+
     parts = [slice(first, first + _TOGETHER) for first in range(0, u.shape[0], _TOGETHER)]
-    return parabolas(reduce(added, (sums_of(u[some], values_at(some)) for some in parts)))
+    return parabolas(reduce(added, map(sums, parts)))
 
 
 def _root_of_squares(columns: FloatArray, error: FloatArray) -> FloatArray:

@@ -124,6 +124,20 @@ def test_parabolas_are_found_again() -> None:
     assert np.abs(error).max() < 1e-3
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_points_without_residuals_do_not_count(value: float) -> None:
+    """One of 1,920 points, far in a tail, cost a crossing its result."""
+    rng = np.random.default_rng(5)
+    u, values = rng.standard_normal((400, 3)), rng.standard_normal((20, 400))
+    impossible = values.copy()
+    impossible[7, [3, 170]] = value
+    found = _fit_parabolas(u, partial(_some_columns, impossible))
+    rest = np.delete(np.arange(400), [3, 170])
+    expected = _fit_parabolas(u[rest], partial(_some_columns, values[:, rest]))
+    for one, other in zip(found, expected, strict=True):
+        assert one == pytest.approx(other, rel=1e-9, abs=1e-12)
+
+
 def test_what_parabolas_do_not_follow_counts_as_no_knowledge() -> None:
     """Of a remainder without parabolas the squares are zero on average, not those of a fit."""
     rng = np.random.default_rng(8)
