@@ -40,6 +40,8 @@ _REFINED_M = (0.3, 0.15)
 _NEIGHBOUR_M, _NEIGHBOURS = 0.1, 6
 """Distance and number of offsets tried on either side of an optimum with mismatch: a compliant
 bearing makes minima 0.2 m apart, which the truck of the scan does not distinguish."""
+_FAR_STRIDE_M = 1.2
+"""Distance of offsets tried farther away: minima metres apart are as wide."""
 _PATIENCE = 1.5  # strides beyond the best place, except for a tandem
 _REACH = 3.0  # of the offset's spread
 _MAX_STRIDES = 60
@@ -124,7 +126,7 @@ def scan_offsets(
         return min(candidates, key=lambda place: place.objective)
 
     fit_at(0.0, nothing)
-    reach = min(_STRIDE_M + _REACH / problem.receiver_rows[-1, -1], _MAX_STRIDES * _STRIDE_M)
+    reach = _reach_m(problem)
     for sign in (1.0, -1.0):
         shift = sign * _STRIDE_M
         while abs(shift) <= reach:
@@ -141,19 +143,38 @@ def scan_offsets(
 
 
 def better_neighbour(found: Optimum, strategy: SearchStrategy) -> tuple[Placement | None, int]:
-    """Return the best candidate near an optimum if it fits better; and the evaluations."""
+    """Return the best candidate about an optimum if it fits better; and the evaluations.
+
+    All offsets that the receiver allows are tried again, with the truck of the optimum: with that
+    of the first scan a wrong bridge may fit as well, metres from the right place.
+    """
     y = found.state.y
     local_fit = _local_fit(found.problem, y, strategy)
     nothing = np.zeros(layout(found.problem).bridge.size)
     here, evaluations = local_fit(0.0, nothing)
     evaluations += y.size + 1
     best = here
-    for number in range(-_NEIGHBOURS, _NEIGHBOURS + 1):
-        if number:
-            place, used = local_fit(_NEIGHBOUR_M * number, nothing)
-            evaluations += used
-            best = min(best, place, key=lambda one: one.objective)
+    for shift in _other_offsets_m(found.problem):
+        place, used = local_fit(shift, nothing)
+        evaluations += used
+        best = min(best, place, key=lambda one: one.objective)
     return (best if best.objective < here.objective - _WALK_MIN_IMPROVEMENT else None), evaluations
+
+
+def _other_offsets_m(problem: PosteriorProblem) -> list[float]:
+    """Return offsets near an optimum, and others as far as the receiver allows.
+
+    Of a tandem these have been scanned already.
+    """
+    near = [_NEIGHBOUR_M * number for number in range(1, _NEIGHBOURS + 1)]
+    strides = 0 if has_tandem(problem) else int(_reach_m(problem) / _FAR_STRIDE_M)
+    far = [_FAR_STRIDE_M * number for number in range(1, strides + 1)]
+    return [sign * shift for shift in near + far for sign in (-1.0, 1.0)]
+
+
+def _reach_m(problem: PosteriorProblem) -> float:
+    """Return the largest offset that the receiver allows."""
+    return float(min(_STRIDE_M + _REACH / problem.receiver_rows[-1, -1], _MAX_STRIDES * _STRIDE_M))
 
 
 def shifted_to(problem: PosteriorProblem, y: FloatArray, place: Placement) -> FloatArray:

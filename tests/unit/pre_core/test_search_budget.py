@@ -93,6 +93,33 @@ def test_the_scan_passes_other_minima_of_a_tandem(
     assert places[0].shift_m == pytest.approx(chosen_m, abs=1e-9)
 
 
+@pytest.mark.parametrize(("is_tandem", "chosen_m"), [(False, -4.8), (True, 0.3)])
+def test_neighbours_of_an_optimum_reach_as_far_as_the_receiver_errs(
+    is_tandem: bool, chosen_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Objectives like those of a crossing that ended five metres off; a tandem was scanned."""
+    seen: list[float] = []
+
+    def look(shift: float, start: Any) -> Any:
+        seen.append(shift)
+        value = min(466.0 + 10.0 * (shift - 0.3) ** 2, 449.0 + 20.0 * (shift + 5.0) ** 2)
+        return walk.Placement(value, shift, start, np.zeros(0, np.int64)), 1
+
+    bridge = SimpleNamespace(bridge=np.arange(3))
+    monkeypatch.setattr(walk, "_local_fit", lambda problem, y, way: look)
+    monkeypatch.setattr(walk, "layout", lambda problem: bridge)
+    monkeypatch.setattr(walk, "has_tandem", lambda problem: is_tandem)
+    here: Any = SimpleNamespace(
+        problem=SimpleNamespace(receiver_rows=np.array([[1.0 / 1.5]])),
+        state=SimpleNamespace(y=np.zeros(4)),
+    )
+    place, evaluations = walk.better_neighbour(here, STRATEGY)
+    assert place is not None
+    assert place.shift_m == pytest.approx(chosen_m, abs=1e-9)
+    assert max(map(abs, seen)) < 3.0 * 1.5 + 0.6
+    assert evaluations == len(seen) + 5
+
+
 @pytest.mark.parametrize("each", [30_000, 60_000, 200_000])
 def test_a_search_that_finds_no_fit_ends_within_its_budget(
     each: int, monkeypatch: pytest.MonkeyPatch
