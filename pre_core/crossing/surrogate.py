@@ -9,8 +9,8 @@ reshapes the normal likelihood (cf. Opper and Archambeau 2009), so that the weig
 draws vary less.
 
 Over its own draws such a regression minimises KL(surrogate || posterior), which neglects what they
-seldom reach: a few draws keep large weights. Later regressions count draws by the square root of
-their weights, half-way to KL(posterior || surrogate).
+seldom reach: a few draws keep large weights. Later regressions count draws by a power of their
+weights, most of the way to KL(posterior || surrogate).
 """
 
 from itertools import product
@@ -31,7 +31,7 @@ _LOWEST = 8.0
 tails are not parabolic."""
 _BATCHES_SEEN, _BATCHES_SEEN_WEIGHTED = 3, 6
 """Number of latest batches that the regression uses, without and with weights."""
-_WEIGHT_POWER = 0.5
+_WEIGHT_POWER = 0.7
 """Power of the weights by which draws count in a weighted regression."""
 _LARGEST_COUNTED = 4.0
 """Log weight, above the median of the latest draws, up to which it counts: one draw alone must not
@@ -178,7 +178,7 @@ def refine(
 
     `log_target` (k,) is the target's log likelihood in the sense of `log_likelihood`; the last
     `latest` draws are those of `surrogate`, and give the scale of x. Where `is_weighted`, draws
-    count by the square root of their weights.
+    count by a power of their weights.
     """
     count = latest * (_BATCHES_SEEN_WEIGHTED if is_weighted else _BATCHES_SEEN)
     x, log_target = x[-count:], log_target[-count:]
