@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from typing import Any
 
+from schemas.validation_records import METHOD_EDITION
 from studies.validation.calibration import SMALLEST_P, Aim, Record, by_condition
 from studies.validation.uncertainty import (
     JUDGED,
     ValidationOutcome,
     aims,
     control_checks,
+    judged_checks,
     largest_z,
     noises,
     number,
@@ -17,7 +19,7 @@ from studies.validation.uncertainty import (
     scenario_rows,
     summary,
 )
-from studies.validation.worlds import HEADINGS, cells, lines_of
+from studies.validation.worlds import HEADINGS, cells, lines_of, world_checks
 
 _HEAD = """# Validation of method `pre`
 
@@ -25,12 +27,15 @@ Are the intervals reliable? This page is written by
 
     {command} --page docs/validation.md
 
-(`make validate`: 200 crossings, 64 of each effect); every figure on it comes from that run. No
-real bridge is among them: no public record of one is known.
+(`make validate`: 200 crossings, 64 of each effect); every figure on it comes from that run, of
+edition {edition} of the method. No real bridge is among them: no public record of one is known.
 
 ## Targets
 
 {aims}
+
+Targets of effects and of an independent simulator, which have tables below, are listed where
+missed.
 """
 
 _DRAWN = """
@@ -155,7 +160,11 @@ Each page has its figures with their commands.
 
 def validation_page(outcome: ValidationOutcome, image: str = "images/calibration.png") -> str:
     """Return the page as Markdown."""
-    text = _HEAD.format(command=_command(outcome), aims=_aims(aims(outcome)))
+    in_tables = world_checks(outcome.worlds)
+    in_tables += [check for line in outcome.judged for check in judged_checks(line)]
+    met = [check for check in in_tables if check.is_met]
+    listed = [check for check in aims(outcome) if check not in met]
+    text = _HEAD.format(command=_command(outcome), edition=METHOD_EDITION, aims=_aims(listed))
     if len(outcome.drawn) > 1:
         text += _drawn(outcome, image)
     if outcome.control:
