@@ -62,7 +62,7 @@ from services.viewer.element_labels import (
 )
 
 HEIGHT_IN = 7.1
-_ERROR = "mean − truth, without offset and tilt"
+_ERROR = "mean − truth, without offset, tilt and bend"
 _HEIGHT_WITHOUT_ROAD_IN = 4.4
 _HEADING_IN, _BANNER_IN = 1.17, 0.36
 """Height of the heading above the first panel, and of a banner in addition."""

@@ -153,7 +153,7 @@ def test_differences_are_between_wheels_and_from_the_truth_where_it_is_known() -
     lines = {line.get_label(): line for line in figure.axes[2].lines}
     assert figure.axes[2].get_ylabel() == "mm"
     assert lines["front − rear"].get_ydata() == pytest.approx(np.full(400, 2e-3))
-    error = np.asarray(lines["mean − truth, without offset and tilt"].get_ydata())
+    error = np.asarray(lines["mean − truth, without offset, tilt and bend"].get_ydata())
     known = X_M <= 30.0  # the truth of this test ends there
     whole = PROFILE_M[known] * 1e3
     line = np.polyval(np.polyfit(X_M[known], whole, 1), X_M[known])
