@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from pre_core.constants import NORMAL_975
+from pre_core.fusion.variability import BETWEEN_SCALE
 from pre_core.search.loop import Report
 from schemas.reasons import BridgeReason, LeftOutReason
 from schemas.results import (
@@ -46,6 +47,10 @@ from services.identification.usable import usable as usable
 _MANY = 2
 """Crossings excluded as contradictory, from which on a state is doubtful: one alone is an error of
 that crossing, of several the bridge itself may have changed."""
+_LOWER, _LARGEST_BETWEEN = 0.025, 1.5 * BETWEEN_SCALE
+"""Quantile of the variability between crossings, and its largest tolerated value. Two groups of
+crossings, of a sound bridge and of one with a loss, would pass as a bridge that varies so much, and
+their mean as its state."""
 _CONTRADICTIONS = frozenset(
     (BridgeReason.CROSSINGS_DISAGREE, BridgeReason.NEWEST_DISAGREE, BridgeReason.MANY_LEFT_OUT)
 )
@@ -158,7 +163,7 @@ def _reasons(found: FusedBridge, crossings: Sequence[FusableCrossing]) -> tuple[
     `crossings` are in the order of their entries.
     """
     reasons = []
-    if found.disagree:
+    if found.disagree or np.quantile(found.between, _LOWER) > _LARGEST_BETWEEN:
         reasons.append(BridgeReason.CROSSINGS_DISAGREE)
     if len(found.left_out) >= _MANY:
         newest = {one.crossing_id for one in crossings[-_MANY:]}

@@ -314,6 +314,25 @@ def write(path: Path, crossings: list[CrossingResult]) -> Path:
     return path
 
 
+@pytest.mark.parametrize(("before", "after"), [(2, 2), (4, 2), (4, 4)])
+def test_crossings_of_two_states_have_no_common_one(
+    before: int, after: int, tmp_path: Path
+) -> None:
+    """Their mean, which is neither state, was `good`: the variability between them took it."""
+    lost = (1.0, 0.6, 0.6, 1.0, 1.0)
+    crossings = [crossing(n) for n in range(before)]
+    crossings += [crossing(before + n, lost) for n in range(after)]
+    out = tmp_path / "out.json"
+    assert main(["fuse", str(write(tmp_path / "all.json", crossings)), "--json", str(out)]) == 0
+    state = load_results(out).bridges["bridge-1"]
+    assert state.verdict == "suspect"
+    assert set(state.reasons) & {
+        BridgeReason.CROSSINGS_DISAGREE,
+        BridgeReason.NEWEST_DISAGREE,
+        BridgeReason.MANY_LEFT_OUT,
+    }
+
+
 def test_the_command_fuses_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     one = write(tmp_path / "one.json", [crossing(n) for n in range(3)])
     other = write(tmp_path / "other.json", [crossing(n) for n in range(2, 5)])
