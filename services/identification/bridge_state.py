@@ -47,8 +47,8 @@ from services.identification.usable import usable as usable
 _MANY = 2
 """Crossings excluded as contradictory, from which on a state is doubtful: one alone is an error of
 that crossing, of several the bridge itself may have changed."""
-_LOWER, _LARGEST_BETWEEN = 0.025, 1.5 * BETWEEN_SCALE
-"""Quantile of the variability between crossings, and its largest tolerated value. Two groups of
+_LARGEST_BETWEEN = 1.5 * BETWEEN_SCALE
+"""Lower limit of the variability between crossings above which a state is doubtful. Two groups of
 crossings, of a sound bridge and of one with a loss, would pass as a bridge that varies so much, and
 their mean as its state."""
 _CONTRADICTIONS = frozenset(
@@ -133,8 +133,8 @@ def state_of(
     found = fused(sources, report, fusing.threads)
     left_out |= dict.fromkeys(found.left_out, LeftOutReason.DISAGREES)
     left_out |= dict.fromkeys(found.other_model, LeftOutReason.OTHER_MODEL)
-    reasons = _reasons(found, wanted)
     between = _summary(found.between)
+    reasons = _reasons(found, between, wanted)
     baseline = fusing.baselines.get(bridge)
     elements = {f"EI_{n}": _summary(ei) for n, ei in enumerate(found.ei_nm2.T, start=1)}
     weakest, losses = _of_resolved(found, elements, baseline)
@@ -157,13 +157,15 @@ def state_of(
     return state.model_copy(update={"finding": _finding(found, state, baseline)})
 
 
-def _reasons(found: FusedBridge, crossings: Sequence[FusableCrossing]) -> tuple[BridgeReason, ...]:
+def _reasons(
+    found: FusedBridge, between: ElementState, crossings: Sequence[FusableCrossing]
+) -> tuple[BridgeReason, ...]:
     """Return why a state is doubtful; nothing for a good one.
 
-    `crossings` are in the order of their entries.
+    `between` is the variability between crossings; `crossings` are in the order of their entries.
     """
     reasons = []
-    if found.disagree or np.quantile(found.between, _LOWER) > _LARGEST_BETWEEN:
+    if found.disagree or between.q025 > _LARGEST_BETWEEN:
         reasons.append(BridgeReason.CROSSINGS_DISAGREE)
     if len(found.left_out) >= _MANY:
         newest = {one.crossing_id for one in crossings[-_MANY:]}
