@@ -34,9 +34,7 @@ def baselines_of(site: Site, beside: Path | None, given: Path | None = None) -> 
     found = Baselines({}, {})
     if given is not None:
         stored = _read(given)
-        for bridge in site.bridges:
-            if bridge.id in stored.bridges:
-                _take(found, given, stored, bridge)
+        _take(found, given, stored, [one for one in site.bridges if one.id in stored.bridges])
         if not found.states:
             names = ", ".join(bridge.id for bridge in site.bridges)
             raise InputError(f"{given}: has no state of {names} to compare with")
@@ -48,7 +46,7 @@ def baselines_of(site: Site, beside: Path | None, given: Path | None = None) -> 
         if beside is None and not path.is_file():
             _log.warning("the baseline %s of %s is missing; see --baseline", path, bridge.id)
             continue
-        _take(found, path, _read(path), bridge)
+        _take(found, path, _read(path), [bridge])
     return found
 
 
@@ -71,10 +69,12 @@ def _read(path: Path) -> Results:
     return load_results(path)
 
 
-def _take(found: Baselines, path: Path, stored: Results, bridge: Bridge) -> None:
-    """Add the baseline of one bridge from a results file."""
-    found.states[bridge.id] = _state_in(path, stored, bridge)
-    found.realms[bridge.id] = realms_of_bridges(stored.crossings).get(bridge.id, set())
+def _take(found: Baselines, path: Path, stored: Results, bridges: list[Bridge]) -> None:
+    """Add the baselines of bridges from one results file."""
+    realms = realms_of_bridges(stored.crossings)
+    for bridge in bridges:
+        found.states[bridge.id] = _state_in(path, stored, bridge)
+        found.realms[bridge.id] = realms.get(bridge.id, set())
 
 
 def _state_in(path: Path, stored: Results, bridge: Bridge) -> BridgeResult:
