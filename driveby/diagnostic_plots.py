@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 from services.common.arrays import Floats
 from services.common.errors import InputError
-from services.notebook.arguments import names_of, wrong
+from services.notebook.arguments import names_of
 from services.notebook.inference import prior_density, prior_draws
-from services.notebook.simulate import Simulation
+from services.notebook.simulate import Simulation, check_truth
 from services.notebook.solution import Identification, Solution, one_solution
 from services.viewer.drawing import MUTED, STYLE, mark_bridge, simplify_axes
 from services.viewer.residual_size import TREND_DEGREE, expected_reach_m
@@ -113,8 +113,7 @@ def plot_posterior(
 
     Raise InputError for an unknown name or a crossing without draws.
     """
-    if truth is not None and not isinstance(truth, Simulation):
-        raise wrong("truth", truth, "what simulate() returns")
+    check_truth(truth)
     solution = one_solution("solution", solution, "plot_posterior")
     true_ei = {} if truth is None else _true_rigidities(solution, truth)
     with matplotlib.rc_context(STYLE):

@@ -7,7 +7,7 @@ from services.common.errors import InputError
 from services.identification.comparison import estimate_of_state
 from services.notebook.arguments import wrong
 from services.notebook.fuse import Fusion
-from services.notebook.simulate import Simulation
+from services.notebook.simulate import Simulation, check_truth
 from services.notebook.solution import Identification, Solution, one_solution
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.bridge_view import view_of_bridge
@@ -32,8 +32,7 @@ def plot(
     `%matplotlib inline`, `pyplot.show()` does not; `figure.savefig("crossing.png", dpi=200)` writes
     it.
     """
-    if truth is not None and not isinstance(truth, Simulation):
-        raise wrong("truth", truth, "what simulate() returns")
+    check_truth(truth)
     if isinstance(found, Fusion):
         if truth is not None:
             raise InputError("truth is drawn with a single crossing, not with a fused bridge")

@@ -110,6 +110,12 @@ class Simulation(NamedTuple):
             write_drive(file_of(path), self.drive, self.site, force=force)
 
 
+def check_truth(truth: Simulation | None) -> None:
+    """Raise InputError if the argument `truth` of a plot is neither None nor a simulation."""
+    if truth is not None and not isinstance(truth, Simulation):
+        raise wrong("truth", truth, "what simulate() returns")
+
+
 @known_arguments(
     "; simulate_recording() has every option of driveby simulate, and Simulation.started_at() sets "
     "the start"
