@@ -160,10 +160,10 @@ Each page has its figures with their commands.
 
 def validation_page(outcome: ValidationOutcome, image: str = "images/calibration.png") -> str:
     """Return the page as Markdown."""
-    in_tables = world_checks(outcome.worlds)
-    in_tables += [check for line in outcome.judged for check in judged_checks(line)]
-    met = [check for check in in_tables if check.is_met]
-    listed = [check for check in aims(outcome) if check not in met]
+    in_tables = [check for line in outcome.judged for check in judged_checks(line)]
+    in_tables += world_checks(outcome.worlds)
+    listed = aims(outcome._replace(judged=[], worlds=()))
+    listed += [check for check in in_tables if not check.is_met]
     text = _HEAD.format(command=_command(outcome), edition=METHOD_EDITION, aims=_aims(listed))
     if len(outcome.drawn) > 1:
         text += _drawn(outcome, image)
