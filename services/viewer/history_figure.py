@@ -213,7 +213,8 @@ def _heading(history: HistoryView, language: Language) -> list[tuple[str, str]]:
     lines = [(language.choice("history.figure_bars", many, unit=unit), MUTED)]
     if history.points:
         lines.append((reference_sentence(history, language), MUTED))
-        lines += [(text, INK) for text in low_references(history, language)]
+        for text in low_references(history, language):
+            lines += [(line, INK) for line in textwrap.wrap(text, _LINE_CHARACTERS)]
     for mark in history.marks:
         if not mark.acknowledged:
             wording = language.text("history.figure_alarm", alarm=mark.sentence)
