@@ -6,7 +6,7 @@ clock, so that the same messages give the same crossings, live or from a recordi
 """
 
 import contextlib
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -73,7 +73,8 @@ class Finder:
         self._newest_boot: dict[tuple[str, str], int] = {}
         self._expected: tuple[bytes, GnssFix] | None = None
         """The last position noted: it is usually fed next, and decoded once."""
-        self._recorded: frozenset[str] = frozenset()
+        self._recorded: dict[str, int] = {}
+        """Wall time in ns up to which a logger has the messages, by truck."""
         self.unknown_vehicles: set[str] = set()
         """Trucks that the site file lacks; none of their crossings can be identified."""
 
@@ -88,12 +89,13 @@ class Finder:
                 del self._trucks[name]
         self.unknown_vehicles.clear()
 
-    def leave_to_recordings(self, vehicles: Collection[str]) -> None:
-        """Exclude crossings of these trucks that began before the first of their messages here.
+    def leave_to_recordings(self, until_ns: Mapping[str, int]) -> None:
+        """Exclude crossings of recorded trucks whose data begin or end too early here.
 
-        The trucks are being recorded, so such a crossing is complete in the recording.
+        `until_ns` is the wall time, by truck, up to which a logger has recorded it: in ns since
+        1970 UTC. Such a crossing is complete in the recording.
         """
-        self._recorded = frozenset(vehicles)
+        self._recorded = dict(until_ns)
 
     def expect(self, key: Key, payload: bytes, *, for_ever: bool = False) -> None:
         """Record a truck's position at its arrival, when another may be on the bridge.
@@ -248,7 +250,7 @@ class Finder:
         if begins and stay.entry_s < truck.forgotten_s + FORGET_EVERY_S:
             return  # earlier data have been forgotten; this was decided before that
         window = self._window(stay, bridge, truck.vehicle)
-        if truck.vehicle.id in self._recorded and truck.boot.is_cut_off_at(window.begin_s):
+        if truck.boot.is_cut_off_at(window.begin_s) and self._is_recorded(truck, stay):
             return
         crossing_id = truck.id_of(bridge.id, stay)
         is_new = crossing_id is None
@@ -266,9 +268,17 @@ class Finder:
                 stay = stay._replace(passage=Passage.TURNED_BACK)
             elif wait(truck, window, stay, now_s):
                 return
+        is_behind = stay.is_over and truck.boot.latest_accel_s() < stay.exit_s
+        if is_behind and self._is_recorded(truck, stay):
+            return  # the connection broke between positions and accelerations
         truck.decide(bridge.id, stay, crossing_id)
         detection = _detection(truck, bridge, found, crossing_id)
         yield Complete(detection, self.scene.data(truck, detection, stay, window))
+
+    def _is_recorded(self, truck: TruckBoot, stay: Stay) -> bool:
+        """Return whether a logger was recording when a stay ended."""
+        until_ns = self._recorded.get(truck.vehicle.id)
+        return until_ns is not None and truck.boot.wall_time_ns(stay.exit_s) <= until_ns
 
     def _named(self, truck: TruckBoot, bridge: Bridge, stay: Stay) -> str:
         """Return the name of a stay that this finder detects for the first time."""

@@ -6,7 +6,7 @@ replaying a recording through it gives the same bytes every time.
 """
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.reasons import Reason
@@ -119,14 +119,14 @@ class Engine:
         self._states.retarget(header, fusing)
         yield from self._waiting.retarget(certificates, self._finder.scene.retargeted)
 
-    def note_recorded(self, vehicles: Collection[str]) -> None:
-        """Set the trucks that a logger records.
+    def note_recorded(self, until_ns: Mapping[str, int]) -> None:
+        """Set the trucks that a logger records, and up to which wall time it did, in ns.
 
-        A crossing that began before the first of their messages here is in a recording, and is left
-        to `take`.
+        A crossing whose data begin or end too early here is in a recording, and is left to `take`
+        (`Finder.leave_to_recordings`).
         """
-        self._finder.leave_to_recordings(vehicles)
-        self._waiting.note_recorded(vehicles)
+        self._finder.leave_to_recordings(until_ns)
+        self._waiting.note_recorded(until_ns)
 
     def expect(self, key: Key, payload: bytes, *, for_ever: bool = False) -> None:
         """Record a truck's position before its message is fed (`Finder.expect`)."""

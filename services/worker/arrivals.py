@@ -2,8 +2,9 @@
 
 from collections import defaultdict
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
+from schemas.signals import NS_PER_S
 from schemas.topics import Key, is_from_recording, topic
 from services.common.intervals import Intervals
 from services.finding.streams import device_time_ns
@@ -25,6 +26,13 @@ before it is processed.
 """
 _STALLED_HISTORY_S = 10.0
 """Time in s without an older message after which a history is processed as it is."""
+_APART_NS = 5 * NS_PER_S
+"""Time in ns by which one stream of a complete history may end before the other.
+
+A crossing whose positions were processed long before its accelerations would count as lost.
+"""
+_TIMED: Final = ("accel", "gnss")
+"""Streams that a crossing needs together."""
 _LONGEST_HISTORY_S = 60.0
 """Time in s after which a history is processed in any case."""
 _KEPT_BOOTS = 8
@@ -85,30 +93,46 @@ class _History:
         """Received sequences by stream."""
         for stream, highest in known.items():
             self._sequences[stream].add_range(0, highest)
+        self._newest_ns = dict.fromkeys(_TIMED, 0)
+        """Latest device time by stream."""
 
     def add(self, message: TruckMessage) -> None:
         self.messages.append(message)
-        sequences = self._sequences[message.key.stream]
+        stream = message.key.stream
+        sequences = self._sequences[stream]
         newest = sequences.highest
         sequences.add(message.sequence)
-        if newest is not None and message.sequence < newest:
+        is_older = newest is not None and message.sequence < newest
+        if stream in _TIMED:
+            time_ns = _device_time_ns(message)
+            is_older |= time_ns < max(self._newest_ns.values()) - _APART_NS
+            self._newest_ns[stream] = max(self._newest_ns[stream], time_ns)
+        if is_older:
             self._grew_s = message.received_s
 
+    def restart(self, now_s: float) -> None:
+        """Wait as long as for a new history: the truck is back, and sends the rest."""
+        self._began_s = self._grew_s = now_s
+
     def is_complete(self, now_s: float) -> bool:
-        if now_s - self._began_s < _HISTORY_S:
-            return False
+        """Return whether nothing is missing."""
+        return now_s - self._began_s >= _HISTORY_S and not self._has_missing()
+
+    def has_stalled(self, now_s: float) -> bool:
+        """Return whether what is missing is unlikely to come, although the truck is there."""
         return (
-            not self._has_missing()
-            or now_s - self._grew_s >= _STALLED_HISTORY_S
+            now_s - self._grew_s >= _STALLED_HISTORY_S
             or now_s - self._began_s >= _LONGEST_HISTORY_S
         )
 
     def _has_missing(self) -> bool:
-        """Return whether sequences are missing between others or before the first.
+        """Return whether one stream ends long before the other, or sequences are missing.
 
-        A boot's sequences begin at 0, and a truck keeps as many as `cache` in the table of topics.
-        A replay may begin anywhere.
+        They are between others or before the first. A boot's sequences begin at 0, and a truck
+        keeps as many as `cache` in the table of topics. A replay may begin anywhere.
         """
+        if max(self._newest_ns.values()) - min(self._newest_ns.values()) > _APART_NS:
+            return True
         realm = self.messages[0].key.realm
         return any(
             sequences.runs > 1
@@ -137,6 +161,8 @@ class ArrivalQueue:
         self._away: set[_Vehicle] = set()
         """Trucks that left: those that return send what they measured meanwhile."""
         self._alive: set[_Vehicle] = set()
+        self._cut_off: set[_Vehicle] = set()
+        """Trucks whose token was lost; some of their messages may still have been in transit."""
         self._leaves: dict[_Vehicle, _Leave] = {}
         self._lost: dict[_Vehicle, float] = {}
         """Time at which the absence of a truck that left counts as permanent."""
@@ -144,7 +170,7 @@ class ArrivalQueue:
     def add(self, message: TruckMessage) -> list[TruckMessage]:
         """Add a message; return it if it can be processed now."""
         truck = (message.key.realm, message.key.identifier)
-        self._note_return(truck)
+        self._note_return(truck, message.received_s)
         if truck not in self._alive:
             self._leaves[truck] = _Leave(message.received_s, _SILENT_S)
             self._lost.pop(truck, None)
@@ -168,38 +194,54 @@ class ArrivalQueue:
             del self._highest[name]
             self._known.discard(name)
 
-    def _note_return(self, truck: _Vehicle) -> None:
+    def _note_return(self, truck: _Vehicle, now_s: float) -> None:
         """Collect a history of a truck that left and is back, as of a new one."""
         if truck in self._away:
             self._away.remove(truck)
             self._known = {name for name in self._known if name[:2] != truck}
+            self._restart_histories(truck, now_s)
+
+    def _restart_histories(self, truck: _Vehicle, now_s: float) -> None:
+        for name, history in self._new.items():
+            if name[:2] == truck:
+                history.restart(now_s)
 
     def note(self, token: LivenessToken) -> None:
         """Record that a truck arrived or departed."""
         truck = (token.realm, token.vehicle)
         if token.is_alive:
-            self._note_return(truck)
+            self._note_return(truck, token.received_s)
+            if truck in self._cut_off:
+                self._cut_off.remove(truck)
+                self._restart_histories(truck, token.received_s)
             self._alive.add(truck)
             self._leaves.pop(truck, None)
             self._lost.pop(truck, None)
         else:
             self._alive.discard(truck)
+            self._cut_off.add(truck)
             self._leaves[truck] = _Leave(token.received_s, GONE_AFTER_S)
 
     def due(self, now_s: float) -> list[TruckMessage]:
         """Return the messages of trucks' histories that are complete, in order of time.
 
-        Nothing is waited for behind a truck that has left.
+        One of a truck that left before it had sent all is kept until the truck is lost: it may be
+        back with the rest, or a recording may have it.
         """
         if not self._new:
             return []
-        left = self._departed(now_s)
         due: list[TruckMessage] = []
         for name, history in list(self._new.items()):
-            if name[:2] in left or history.is_complete(now_s):
+            if history.is_complete(now_s) or self._is_given_up(name[:2], history, now_s):
                 self._known.add(name)
                 due += sorted(self._new.pop(name).messages, key=_device_time_ns)
         return due
+
+    def _is_given_up(self, truck: _Vehicle, history: _History, now_s: float) -> bool:
+        """Return whether an incomplete history is processed as it is."""
+        if truck in self._away or truck in self._cut_off:
+            return truck not in self._leaves and self._lost.get(truck, now_s) <= now_s
+        return history.has_stalled(now_s)
 
     def gone(self, now_s: float) -> list[DepartedTruck]:
         """Return the trucks found to have left since the last call."""

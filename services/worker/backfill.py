@@ -141,7 +141,7 @@ class Backfill:
             self._next_scan_s = now_s + _SCAN_EVERY_S
             now = time.time()
             self._recordings.update(now, self._scanning)
-            engine.note_recorded(self._recordings.growing)
+            engine.note_recorded(self._recordings.until_ns)
             self._ledger.forget_before(now - self._source.age_s - MARGIN_S)
         self._collect()
         self._ledger.commit(time.time())
@@ -183,7 +183,7 @@ class Backfill:
 
     def _begin_scan(self, group: RecordingGroup) -> None:
         self._scanning = group
-        paths = tuple(file.path for file in group.files)
+        paths = tuple(file.path for file in group.files if file.path.exists())
         run = partial(scan_stays, paths, self._source.realm, group.vehicle, self._site)
         self._submit(BackgroundTask(f"scan recordings of {group.vehicle}", run))
 

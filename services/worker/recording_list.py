@@ -21,6 +21,13 @@ The preceding file is read too, where a crossing may have started.
 _NAME: Final = re.compile(rf"({IDENTIFIER})-\d{{8}}T\d{{6}}Z(?:-\d+)?(?:\.recovered)?\.mcap")
 _Signature = tuple[int, int]
 """Size, and time of the last change in ns."""
+_RECENT_S: Final = 600.0
+"""Age in s up to which a recording is needed to decide what its truck sends again.
+
+A truck keeps five minutes of its messages for those that were away.
+"""
+_GROWS_NS: Final = (1 << 63) - 1
+"""Time up to which a growing recording will have everything."""
 _QUIET_S: Final = 120.0
 """Time in s after a truck's last message from which missing data count as lost.
 
@@ -61,6 +68,8 @@ class RecordingList:
         """Groups to read."""
         self.growing: set[str] = set()
         """Trucks that are being recorded."""
+        self.until_ns: dict[str, int] = {}
+        """Wall time in ns up to which a truck is recorded, as far as it was lately."""
         self.final: set[str] = set()
         """Trucks that are no longer being recorded."""
 
@@ -73,11 +82,15 @@ class RecordingList:
         """List the recordings at `now`, the time in s since 1970; `reading` is being read."""
         by_vehicle = self._by_vehicle(now)
         self.growing = {v for v, files in by_vehicle.items() if any(f.is_growing for f in files)}
+        last_ns = {v: max(f.signature[1] for f in files) for v, files in by_vehicle.items()}
+        recent_ns = round((now - _RECENT_S) * NS_PER_S)
+        self.until_ns = {v: at_ns for v, at_ns in last_ns.items() if at_ns >= recent_ns}
+        self.until_ns |= dict.fromkeys(self.growing, _GROWS_NS)
         quiet_ns = round((now - _QUIET_S) * NS_PER_S)
         self.final = {
             vehicle
-            for vehicle, files in by_vehicle.items()
-            if vehicle not in self.growing and max(f.signature[1] for f in files) < quiet_ns
+            for vehicle, at_ns in last_ns.items()
+            if vehicle not in self.growing and at_ns < quiet_ns
         }
         seen = {file.path for files in by_vehicle.values() for file in files}
         self._read = {path: signature for path, signature in self._read.items() if path in seen}

@@ -1,8 +1,11 @@
 """Messages in, crossings out: each once as it begins and once with its data."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import pytest
 
+from schemas.topics import Message
 from services.finding.crossing_data import Complete, Detection, close_window, wide_window
 from services.finding.finder import Finder, Found, Name, Recognise, crossings_in
 from services.identification.engine import Engine
@@ -56,13 +59,32 @@ def test_a_stay_that_is_decided_elsewhere_is_not_found_again() -> None:
     assert not finder.has_undecided(TWO[0].key.realm, TWO[0].key.identifier)
 
 
-@pytest.mark.parametrize(("recorded", "crossings"), [((), 2), (("truck-1",), 1)])
-def test_what_began_before_is_left_to_a_recording(
-    recorded: tuple[str, ...], crossings: int
-) -> None:
+ALWAYS_NS = 1 << 62
+
+
+def complete(finder: Finder, messages: Iterable[Message]) -> list[Complete]:
+    events = [one for m in messages for one in finder.feed(m.key, m.payload)]
+    return [one for one in (*events, *finder.finish()) if isinstance(one, Complete)]
+
+
+@pytest.mark.parametrize(
+    ("until_ns", "crossings"), [({}, 2), ({"truck-1": ALWAYS_NS}, 1), ({"truck-1": 0}, 2)]
+)
+def test_what_began_before_is_left_to_a_recording(until_ns: dict[str, int], crossings: int) -> None:
     finder = Finder(SITE, wide_window)
-    finder.leave_to_recordings(recorded)
+    finder.leave_to_recordings(until_ns)
     first_ns = TWO[0].log_time_ns
     rest = [m for m in TWO if m.log_time_ns > first_ns + 7_500_000_000]
-    events = [one for m in rest for one in finder.feed(m.key, m.payload)]
-    assert sum(isinstance(one, Complete) for one in [*events, *finder.finish()]) == crossings
+    assert len(complete(finder, rest)) == crossings
+
+
+@pytest.mark.parametrize(
+    ("until_ns", "crossings"), [({}, 2), ({"truck-1": ALWAYS_NS}, 0), ({"truck-1": 0}, 2)]
+)
+def test_positions_that_came_alone_are_left_to_a_recording(
+    until_ns: dict[str, int], crossings: int
+) -> None:
+    """As where the connection broke after them; without a recording nothing more will come."""
+    finder = Finder(SITE, wide_window)
+    finder.leave_to_recordings(until_ns)
+    assert len(complete(finder, [m for m in TWO if m.key.stream != "accel"])) == crossings

@@ -211,7 +211,7 @@ def test_results_wait_for_room_and_delay_no_process() -> None:
     asking = Asking({PAIR: DIGEST}, has_room=False)
     assert len([o for o in asking.fed(TWO) if o.result]) == 2
     asking = Asking({PAIR: DIGEST}, has_room=False)
-    asking.engine.note_recorded({"truck-1"})
+    asking.engine.note_recorded({"truck-1": 1 << 62})
     outputs = asking.fed(TWO)
     assert names(outputs) == of_one(ONE, "DETECTED", "COMPLETE") + of_one(
         OTHER, "DETECTED", "COMPLETE"

@@ -136,15 +136,89 @@ def test_no_history_is_collected_for_longer_than_a_minute() -> None:
     assert len(arrivals.due(60.0)) == 60
 
 
-def test_history_of_a_truck_that_has_left_is_processed_before_its_departure() -> None:
+def of_stream(stream: str, at_s: float, numbers: range) -> list[TruckMessage]:
+    """Return messages of the seconds `numbers` of a drive."""
+    kind = {"accel": pb.AccelBatch, "gnss": pb.GnssFix}[stream]
+    key = Key(REALM, "vehicle", "truck-1", stream)
+    return [
+        TruckMessage(key, 1, n, kind(device_time_ns=n * 10**9).SerializeToString(), at_s)
+        for n in numbers
+    ]
+
+
+def test_positions_wait_for_the_accelerations_of_the_same_time() -> None:
+    """Those are ten times as large, and come one after the other over a slow line."""
+    arrivals = ArrivalQueue()
+    history = of_stream("gnss", 0.0, range(300))
+    for one in history:
+        arrivals.add(one)
+    for second in range(30):
+        assert arrivals.due(float(second)) == []
+        for one in of_stream("accel", float(second), range(10 * second, 10 * second + 10)):
+            history.append(one)
+            arrivals.add(one)
+    due = arrivals.due(30.0)
+    assert [one.sequence for one in due] == sorted(one.sequence for one in history)
+
+
+def test_positions_without_accelerations_are_processed_after_ten_seconds() -> None:
+    arrivals = ArrivalQueue()
+    fixes = of_stream("gnss", 0.0, range(11))
+    for one in fixes:
+        arrivals.add(one)
+    assert arrivals.due(9.9) == []
+    assert arrivals.due(10.0) == fixes
+
+
+@pytest.mark.parametrize("in_transit", [0, 10])
+def test_history_that_a_broken_connection_cuts_off_is_continued(in_transit: int) -> None:
+    """A logger that hosts the router was killed: truck and rest are back within half a minute.
+
+    Messages and tokens come by two ways, so some messages may come after the token's loss.
+    """
+    arrivals = ArrivalQueue()
+    arrivals.note(token(0.0, is_alive=True))
+    history = of_stream("gnss", 0.0, range(100)) + of_stream("accel", 0.0, range(40))
+    for one in history[: len(history) - in_transit]:
+        arrivals.add(one)
+    arrivals.note(token(0.5, is_alive=False))
+    for one in history[len(history) - in_transit :]:
+        arrivals.add(one._replace(received_s=0.6))
+    departures = []
+    for tenth in range(35, 290):
+        assert arrivals.due(tenth / 10) == []
+        departures += arrivals.gone(tenth / 10)
+    assert departures == [gone()]
+    arrivals.note(token(30.0, is_alive=True))
+    assert arrivals.due(30.5) == []
+    rest = of_stream("accel", 31.0, range(40, 100))
+    for one in rest:
+        assert arrivals.add(one) == []
+    due = arrivals.due(31.0)
+    assert [one.sequence for one in due] == sorted(2 * list(range(100)))
+
+
+def test_history_cut_off_for_ever_is_processed_when_the_truck_is_lost() -> None:
     arrivals = ArrivalQueue()
     arrivals.note(token(0.0, is_alive=True))
     only = numbered(0.0, 700)
     arrivals.add(only)
     arrivals.note(token(2.0, is_alive=False))
-    assert arrivals.due(4.9) == []
-    assert arrivals.due(5.0) == [only]
+    assert arrivals.due(5.0) == []
     assert arrivals.gone(5.0) == [gone()]
+    assert arrivals.due(121.9) == []
+    assert arrivals.due(122.0) == [only]
+    assert arrivals.gone(122.0) == [gone(for_good=True)]
+
+
+def test_complete_history_of_a_truck_that_has_left_is_processed_before_its_departure() -> None:
+    arrivals = ArrivalQueue()
+    arrivals.note(token(0.0, is_alive=True))
+    only = numbered(0.0, 0)
+    arrivals.add(only)
+    arrivals.note(token(0.1, is_alive=False))
+    assert arrivals.due(3.1) == [only]
+    assert arrivals.gone(3.1) == [gone()]
 
 
 def test_messages_of_a_returned_truck_are_put_in_order_of_time() -> None:

@@ -3,7 +3,7 @@
 import fcntl
 import os
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import cast
 
@@ -73,12 +73,12 @@ class Worker:
         known = known_crossings(sent, search_hash(HEADER))
         self.engine = Engine(SITE, SETTINGS, HEADER, **engine)  # type: ignore[arg-type]
         self.ledger = Ledger(known, time.time())
-        self.recorded: set[str] = set()
+        self.recorded: dict[str, int] = {}
         noted = self.engine.note_recorded
 
-        def note_recorded(vehicles: Collection[str]) -> None:
-            self.recorded = set(vehicles)
-            noted(vehicles)
+        def note_recorded(until_ns: Mapping[str, int]) -> None:
+            self.recorded = dict(until_ns)
+            noted(until_ns)
 
         self.engine.note_recorded = note_recorded  # type: ignore[method-assign]
         list(self.engine.resume(known))
@@ -255,23 +255,39 @@ def restarted(message: Message) -> Message:
     return message._replace(boot_id=boot_id, log_time_ns=time_ns, payload=payload)
 
 
-def test_a_history_that_begins_on_the_bridge_is_left_to_the_recording(
-    tmp_path: Path, record: Callable[..., Path]
+@pytest.mark.parametrize("is_killed", [False, True])
+@pytest.mark.parametrize(
+    ("sent", "in_recording"),
+    [
+        ([m for m in TWO if m.log_time_ns * 1e-9 - START_S > 7.5], IDS[:1]),
+        ([m for m in TWO if m.key.stream != "accel"], IDS),
+    ],
+    ids=["from the middle of the bridge on", "positions alone"],
+)
+def test_a_crossing_of_which_a_part_is_sent_is_left_to_the_recording(
+    tmp_path: Path,
+    record: Callable[..., Path],
+    sent: list[Message],
+    in_recording: list[str],
+    *,
+    is_killed: bool,
 ) -> None:
-    """The truck is recorded, but keeps only what is from the middle of the bridge on."""
+    """The truck is recorded; a logger that is killed writes no more, and has what it has."""
     path = record(TWO, ago_s=10.0)
-    rest = [m for m in TWO if m.log_time_ns * 1e-9 - START_S > 7.5]
     alone = Worker(tmp_path / "nowhere")
-    assert len(alone.feed(rest)) == 2
+    assert len(alone.feed(sent) + alone.leave(for_good=True)) == 2
     worker = Worker(tmp_path)
-    writer = path.open("r+b")
-    fcntl.flock(writer, fcntl.LOCK_EX)
-    assert worker.go_on(1) == []
-    assert worker.recorded == {"truck-1"}
-    assert ids(worker.feed(rest)) == IDS[1:]
-    writer.close()
-    (result,) = worker.go_on()
-    assert (result.crossing_id, result.verdict) == (IDS[0], "good")
+    with path.open("r+b") as writer:
+        if not is_killed:
+            fcntl.flock(writer, fcntl.LOCK_EX)
+        assert worker.go_on(1) == []
+        assert set(worker.recorded) == {"truck-1"}
+        here = worker.feed(sent)
+    here += worker.leave(for_good=True)
+    assert set(ids(here)).isdisjoint(in_recording)
+    found = worker.go_on()
+    assert sorted(ids([*here, *found])) == IDS
+    assert {result.verdict for result in found} == {"good"}
 
 
 def test_without_a_certificate_they_stay_in_the_recording(
