@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
-from services.catalogue.row import CatalogRow, details_text, file_sha256, row_of
+from services.catalogue.row import CatalogRow, StillOpenError, details_text, file_sha256, row_of
 from services.common.errors import FailureError, InputError
 from services.common.extras import check_extras
 from services.common.files import is_unicode
@@ -60,6 +60,8 @@ class CatalogUpdate(NamedTuple):
 
     rows: dict[str, CatalogRow]
     added: int
+    still_open: int
+    """Number of recordings that are being written: they have no row yet."""
     problems: tuple[str, ...]
     """Lost, changed or unreadable recordings and invalid files of rows, one line each."""
 
@@ -145,7 +147,7 @@ def update_catalog(
     problems = list(before.problems)
     recordings = {e.name: e for e in files_below(folder, ".mcap")}
     rows: dict[str, CatalogRow] = {}
-    added = 0
+    added = still_open = 0
     gone = before.rows.keys() - recordings.keys()
     problems += [f"{folder.name}/{path}: is gone; its row is dropped" for path in sorted(gone)]
     for path, entry in recordings.items():
@@ -164,6 +166,8 @@ def update_catalog(
                 added += 1
             else:
                 rows[path] = old
+        except StillOpenError:
+            still_open += 1
         except InputError as error:
             problems.append(str(error))
     try:
@@ -176,7 +180,7 @@ def update_catalog(
             "(%s)",
             *(folder.name, error),
         )
-    return CatalogUpdate(rows, added, tuple(problems))
+    return CatalogUpdate(rows, added, still_open, tuple(problems))
 
 
 def _contradiction(folder: Folder, entry: Entry, row: CatalogRow, *, verify: bool) -> str | None:

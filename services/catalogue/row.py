@@ -9,6 +9,7 @@ from typing import BinaryIO, Final, NamedTuple
 from schemas.signals import NS_PER_S, decode_accel, decode_gnss
 from schemas.topics import Key, topic
 from services.common.errors import InputError
+from services.common.files import is_held
 from services.common.language import utc_day
 from services.common.stores import Entry, Folder, opened
 from services.finding.bridges import Box
@@ -52,17 +53,24 @@ class CatalogRow(NamedTuple):
         return utc_day(self.first_ns / NS_PER_S)
 
 
+class StillOpenError(InputError):
+    """A recording that a process is writing: it gets its row when it is closed."""
+
+
 def row_of(folder: Folder, entry: Entry) -> CatalogRow:
     """Read a closed recording once for its row, and once for its hash.
 
-    Raise InputError if it is unreadable, still open or truncated, or has no driveby message.
+    Raise StillOpenError if it is being written, otherwise InputError if it is unreadable or
+    truncated, or has no driveby message.
     """
     where = f"{folder.name}/{entry.name}"
     with opened(folder, entry.name) as file:
         index = read_index(file, entry.size_bytes)
         if index is None:
+            if folder.is_local and is_held(file):
+                raise StillOpenError(f"{where}: is being written")
             raise InputError(
-                f"{where}: has no index: it is being written, or was cut off "
+                f"{where}: has no index: it was cut off, or is being written on another machine "
                 "(driveby recover repairs it)"
             )
         builder = _RowBuilder()

@@ -1,8 +1,8 @@
 """Entry point of `driveby`: parse arguments, call one function, map errors to exit codes.
 
-Exit codes: 0 success, 1 failure, 2 bad input; 3 for `recover`, `identify --into` and `history add`:
-success, but something is lost. Functions are imported when they are called, so that `driveby
---help` does not wait for compilers and viewers.
+Exit codes: 0 success, 1 failure, 2 bad input; 3 for `recover`, `catalog`, `identify --into` and
+`history add`: success, but something is lost. Functions are imported when they are called, so that
+`driveby --help` does not wait for compilers and viewers.
 """
 
 import argparse

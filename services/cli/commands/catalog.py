@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from services.cli.parser import Subcommand
+from services.cli.parsing import EXIT_SOMETHING_LOST
 from services.common.kinds import CATALOG_CSV, CROSSINGS_CSV
 from services.common.naming import count_of
 from services.common.options import flag, output_option, positional, site_option
@@ -53,6 +54,8 @@ def _catalog(options: CatalogOptions) -> int:
         print(problem)
     rows = sorted(mended.rows.values(), key=lambda row: (row.first_ns, row.path))
     print(_summary(rows, mended.added))
+    if mended.still_open:
+        print(f"{count_of(mended.still_open, 'more recording')} being written")
     table = list(_table_of_rows(rows))
     if site is not None:
         found = crossings_of(folder, rows, site)
@@ -63,7 +66,7 @@ def _catalog(options: CatalogOptions) -> int:
     if options.csv is not None:
         write_atomically(options.csv, "".join(_csv(line) for line in table))
         print(options.csv)
-    return 0
+    return EXIT_SOMETHING_LOST if mended.problems else 0
 
 
 def _summary(rows: "list[CatalogRow]", added: int) -> str:

@@ -51,3 +51,21 @@ def test_nights_after_a_loss_of_stiffness_raise_an_alarm(project: Path, tmp_path
     )
     assert again.returncode == 0, again.stderr
     assert "12 crossings, 12 from earlier runs" in again.stdout
+
+
+@pytest.mark.parametrize(("code", "commands"), [(0, 4), (3, 4), (1, 2), (2, 2)])
+def test_a_night_with_losses_still_checks_for_alarms(
+    project: Path, tmp_path: Path, code: int, commands: int
+) -> None:
+    """A cut-off recording must not keep the other bridges from being watched."""
+    stub = tmp_path / "driveby"
+    stub.write_text(f'#!/bin/sh\necho "$1" >> called\n[ "$1" != identify ] || exit {code}\n')
+    stub.chmod(0o755)
+    done = subprocess.run(
+        ["sh", project / "docs/examples/fleet_night/night.sh", "r", "s.toml", "t.csv"],
+        cwd=tmp_path,
+        env=os.environ | {"PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}"},
+    )
+    assert done.returncode == code
+    called = (tmp_path / "called").read_text().split()
+    assert called == ["catalog", "identify", "history", "alarm"][:commands]
