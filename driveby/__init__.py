@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from schemas.signals import CHANNELS as CHANNELS
     from schemas.site import Site as Site
     from schemas.site_file import load_site as load_site
+    from schemas.site_file import site_toml as site_toml
     from schemas.site_file import with_values as with_values
     from services.common.errors import FailureError as FailureError
     from services.common.errors import InputError as InputError
@@ -63,6 +64,7 @@ __all__ = [
     "report",
     "simulate",
     "simulate_recording",
+    "site_toml",
     "survey",
     "with_values",
 ]
@@ -89,6 +91,7 @@ _PLACES = {
     "report": "driveby.reports",
     "simulate": "services.notebook.simulate",
     "simulate_recording": "driveby.simulations",
+    "site_toml": "schemas.site_file",
     "survey": "driveby.surveys",
     "with_values": "schemas.site_file",
 }

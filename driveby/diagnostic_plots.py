@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from schemas.results import Parameter
 from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.notebook.arguments import names_of
@@ -32,7 +33,7 @@ _SHOWN: Final = 6.0
 """Posterior standard deviations on either side of the mean that are drawn."""
 _POSTERIOR_OPACITY: Final = 0.6
 """Opacity through which the prior behind the posterior shows."""
-_CUT: Final = (0.5, 99.5)
+_CUT: Final = (0.05, 99.95)
 """Percentiles of the prior draws that are drawn."""
 
 
@@ -119,40 +120,50 @@ def plot_posterior(
     with matplotlib.rc_context(STYLE):
         figure, panels = _panels(_chosen(solution, names), 2.0)
         for name, axes in panels:
-            found = solution.value[name]
-            divisor, unit = _shown_unit(found.mean, found.unit)
-            draws = solution.draws[name].ravel() / divisor
-            window = (found.mean + np.array([-_SHOWN, _SHOWN]) * found.std) / divisor
-            if found.prior is not None:
-                prior = prior_draws(found.prior) / divisor
-                limits = np.percentile(prior, _CUT)
-                if found.prior.distribution == "half_normal":
-                    limits[0] = 0.0
-                at = np.linspace(limits[0], limits[1], _POINTS)
-                heights = prior_density(found.prior, at * divisor)
-                heights /= heights.max()
-                axes.fill_between(at, heights, color=_PRIOR, lw=0.0, label="prior")
-                window = _reaching(window, prior, heights, at)
-                if found.prior.distribution in ("half_normal", "log_normal"):
-                    window[0] = max(window[0], -_BELOW_ZERO * window[1])
-            heights, edges = _density(draws, np.array([draws.min(), draws.max()]))
-            axes.stairs(
-                heights, edges, fill=True, color="C0", alpha=_POSTERIOR_OPACITY, label="posterior"
-            )
-            for limit in (found.q025, found.q975):
-                axes.axvline(limit / divisor, color="0.3", lw=0.8, ls="--")
-            if name in true_ei:
-                true = true_ei[name] / divisor
-                axes.axvline(true, color="C3", lw=1.2, label="truth")
-                window = np.array([min(window[0], true), max(window[1], true)])
-            axes.set_xlim(*window)
-            axes.set_ylim(0.0, 1.08)
-            axes.set_xlabel(unit)
-            axes.set_yticks([])
+            _draw_densities(axes, solution.value[name], solution.draws[name], true_ei.get(name))
         figure.supylabel("density over its maximum", fontsize="medium")
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=3)
     return figure
+
+
+def _draw_densities(axes: Axes, found: Parameter, drawn: Floats, true: float | None) -> None:
+    """Draw prior and posterior of one parameter in a panel."""
+    divisor, unit = _shown_unit(found.mean, found.unit)
+    draws = drawn.ravel() / divisor
+    window = (found.mean + np.array([-_SHOWN, _SHOWN]) * found.std) / divisor
+    if found.prior is not None:
+        prior = prior_draws(found.prior) / divisor
+        limits = np.percentile(prior, _CUT)
+        if found.prior.distribution == "half_normal":
+            limits[0] = 0.0
+        at = np.linspace(limits[0], limits[1], _POINTS)
+        heights = prior_density(found.prior, at * divisor)
+        heights /= heights.max()
+        axes.fill_between(at, heights, color=_PRIOR, lw=0.0, label="prior")
+        window = _reaching(window, prior, heights, at)
+        if found.prior.distribution in ("half_normal", "log_normal"):
+            window[0] = max(window[0], -_BELOW_ZERO * window[1])
+    window = _with_width(window)
+    heights, edges = _density(draws, _with_width(np.array([draws.min(), draws.max()]), window))
+    axes.stairs(heights, edges, fill=True, color="C0", alpha=_POSTERIOR_OPACITY, label="posterior")
+    for limit in (found.q025, found.q975):
+        axes.axvline(limit / divisor, color="0.3", lw=0.8, ls="--")
+    if true is not None:
+        axes.axvline(true / divisor, color="C3", lw=1.2, label="truth")
+        window = np.array([min(window[0], true / divisor), max(window[1], true / divisor)])
+    axes.set_xlim(*window)
+    axes.set_ylim(0.0, 1.08)
+    axes.set_xlabel(unit)
+    axes.set_yticks([])
+
+
+def _with_width(limits: Floats, within: Floats | None = None) -> Floats:
+    """Return limits (2,), widened where they are one value, as of a torsion without effect."""
+    if limits[0] < limits[1]:
+        return limits
+    half = max(abs(limits[0]), 1.0) if within is None else 0.5 * np.ptp(within) / _BINS
+    return np.asarray(limits + np.array([-half, half]))
 
 
 def _true_rigidities(solution: Solution, truth: Simulation) -> dict[str, float]:

@@ -1,8 +1,8 @@
 """Reports for owners of bridges from a notebook, as by `driveby report`."""
 
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Final
 
 from schemas.results import Results, load_results
 from schemas.site import Site
@@ -16,9 +16,8 @@ from services.notebook.fuse import RESULTS_EXPECTED, Fusion, check_identifiers
 from services.notebook.read import Name, given_site
 from services.notebook.solution import Identification
 from services.report.bridge import bridge_reports
+from services.report.earlier import NamedResults
 from services.report.page import page
-
-_BASELINE: Final = "the name of a results file"
 
 
 @known_arguments()
@@ -26,15 +25,16 @@ def report(
     *sources: Name | Identification | Fusion,
     output: Name = "report.html",
     site: Name | Site | None = None,
-    baseline: Name | None = None,
+    baseline: Name | Identification | Fusion | None = None,
     language: str = "en",
 ) -> Path:
     """Write results (files, or what `identify` or `fuse` returned) as one printable HTML file.
 
-    `baseline` is an earlier results file, whose numbers stand next to these; `language` is `en` or
-    `de`. `site` is needed where the folder of a results file has no recording. Return the path.
-    Raise InputError, in one line, for results that cannot be reported, or crossings in memory that
-    differ and have one identifier.
+    `baseline` is earlier results, whose numbers stand next to these; by default those with which
+    one `fuse` compared its sources, or the site file's. `language` is `en` or `de`. `site` is
+    needed where the folder of a results file has no recording. Return the path. Raise InputError,
+    in one line, for results that cannot be reported, or crossings in memory that differ and have
+    one identifier.
     """
     path = path_of("output", output, "the name of an HTML file (.html)")
     if path.suffix not in (".html", ".htm"):
@@ -50,11 +50,23 @@ def report(
         [source.results for source in sources if isinstance(source, Identification | Fusion)]
     )
     beside = Path(site).parent if isinstance(site, str | PathLike) else None
-    before = None if baseline is None else path_of("baseline", baseline, _BASELINE)
+    before = _baseline(sources, baseline)
     words = language_of(language)
     reports = bridge_reports(files, before, beside, words)
     write_atomically(path, page(reports, language=words))
     return path
+
+
+def _baseline(sources: Sequence[object], given: object) -> Path | NamedResults | None:
+    """Return the results to compare with."""
+    if isinstance(given, Identification | Fusion):
+        return NamedResults(Path(type(given).__name__.lower()), given.results)
+    if given is not None:
+        return path_of("baseline", given, RESULTS_EXPECTED)
+    (first, *more) = sources
+    if more or not isinstance(first, Fusion) or first.baseline is None:
+        return None
+    return NamedResults(Path("given to fuse"), first.baseline)
 
 
 def _file(source: object, given: Site | None) -> tuple[Path, Results, Site]:

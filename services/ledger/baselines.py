@@ -33,7 +33,7 @@ def baselines_of(site: Site, beside: Path | None, given: Path | None = None) -> 
     """
     found = Baselines({}, {})
     if given is not None:
-        stored = _read(given)
+        stored = read_baseline(given)
         _take(found, given, stored, [one for one in site.bridges if one.id in stored.bridges])
         if not found.states:
             names = ", ".join(bridge.id for bridge in site.bridges)
@@ -46,7 +46,7 @@ def baselines_of(site: Site, beside: Path | None, given: Path | None = None) -> 
         if beside is None and not path.is_file():
             _log.warning("the baseline %s of %s is missing; see --baseline", path, bridge.id)
             continue
-        _take(found, path, _read(path), [bridge])
+        _take(found, path, read_baseline(path), [bridge])
     return found
 
 
@@ -61,10 +61,11 @@ def realms_of_bridges(crossings: Iterable[CrossingResult]) -> dict[str, set[str]
 
 def stored_state(path: Path, bridge: Bridge) -> BridgeResult:
     """Return a bridge's state from a results file; InputError if it has none with its elements."""
-    return _state_in(path, _read(path), bridge)
+    return state_in(path, read_baseline(path), bridge)
 
 
-def _read(path: Path) -> Results:
+def read_baseline(path: Path) -> Results:
+    """Return the results of a baseline; InputError if the file is unreadable."""
     add_input(path)  # first: the results to be written must not replace it, whatever it holds
     return load_results(path)
 
@@ -73,11 +74,12 @@ def _take(found: Baselines, path: Path, stored: Results, bridges: list[Bridge]) 
     """Add the baselines of bridges from one results file."""
     realms = realms_of_bridges(stored.crossings)
     for bridge in bridges:
-        found.states[bridge.id] = _state_in(path, stored, bridge)
+        found.states[bridge.id] = state_in(path, stored, bridge)
         found.realms[bridge.id] = realms.get(bridge.id, set())
 
 
-def _state_in(path: Path, stored: Results, bridge: Bridge) -> BridgeResult:
+def state_in(path: Path, stored: Results, bridge: Bridge) -> BridgeResult:
+    """Return a bridge's state in results read from `path`; InputError as `stored_state`."""
     state = stored.bridges.get(bridge.id)
     if state is None or len(state.elements) != bridge.elements:
         raise InputError(

@@ -20,7 +20,8 @@ _SEED: Final = 1
 def prior_of(crossings: Sequence[CrossingResult]) -> "xr.Dataset":
     """Return draws of the priors as arrays (chain, draw, crossing), one chain of 2000.
 
-    The names are those of the posterior. Common factors of mass and gain are not in them.
+    The names are those of the posterior. Common factors of mass and gain are not in them, nor is
+    the probability of one half that a spring, a compliance or a torsion is exactly zero.
     """
     rng = np.random.default_rng(_SEED)
     drawn = []

@@ -135,13 +135,14 @@ def simulate(
 ) -> Simulation:
     """Simulate a crossing of the site's first bridge by its first truck.
 
-    The options are those of `driveby simulate`. The truth is a damage `scenario` of the paper (1 to
-    12) or `ei` (n,), the ratio of each element's EI to its nominal value. `site` is by default that
-    of the paper. `road` is an ISO 8608 class, A to E (by default the site's, or A), or a profile
-    under both axles: chainages from the start of the bridge and heights (n,) in m, level beyond its
-    ends. `noise` is the accelerometers' noise density in µg/√Hz, by default that of a given site,
-    else 0; method pre needs some. `speed` is in m/s, or a pair (start, end); `rate` in Hz is by
-    default the site's. BLAS is limited to one thread meanwhile.
+    `simulate_recording` has every option of `driveby simulate`. The truth is a damage `scenario` of
+    the paper (1 to 12) or `ei` (n,), the ratio of each element's EI to its nominal value. `site` is
+    by default that of the paper. `road` is an ISO 8608 class, A to E (by default the site's, or A),
+    or a profile under both axles: chainages from the start of the bridge and heights (n,) in m,
+    level beyond its ends; `seed` draws road, noise and receiver errors. `noise` is the
+    accelerometers' noise density in µg/√Hz, by default that of a given site, else 0; method pre
+    needs some. `speed` is in m/s, or a pair (start, end); `rate` in Hz is by default the site's.
+    BLAS is limited to one thread meanwhile.
 
     All drives begin at one time; crossings to be fused need others: `Simulation.started_at`.
 

@@ -140,7 +140,11 @@ class Identification(NamedTuple):
         return posterior(_draws_of(solution) for solution in _with_draws(self.solutions))
 
     def prior(self) -> "xr.Dataset":
-        """Return draws of the priors, named as the posterior's; needs xarray."""
+        """Return draws of the priors, named as the posterior's; needs xarray.
+
+        Springs, compliances and, without a declared lane, torsion are zero with a probability of
+        one half; the draws are of the other half.
+        """
         return prior_of([solution.crossing for solution in self.solutions if solution.draws])
 
     def to_netcdf(self, path: str | Path) -> None:

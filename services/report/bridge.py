@@ -30,7 +30,13 @@ from services.identification.comparison import (
     weak_before,
 )
 from services.report.cautions import CautionBasis, cautions
-from services.report.earlier import Before, SurveyFile, before_of, combined_surveys
+from services.report.earlier import (
+    Before,
+    NamedResults,
+    SurveyFile,
+    before_of,
+    combined_surveys,
+)
 from services.report.quality import MAX_REASONS, quality, realm_of, reasons_of
 from services.report.repeats import newest_of_each, repeated
 from services.viewer.bridge_view import BridgeView, describe_bridge, view_of_bridge
@@ -81,7 +87,7 @@ class BridgeReport(NamedTuple):
 
 def bridge_reports(
     files: Sequence[tuple[Path, Results, Site]],
-    baseline: Path | None,
+    baseline: Path | NamedResults | None,
     beside: Path | None = None,
     language: Language = ENGLISH,
     validations: Path = CERTIFICATES,
@@ -90,10 +96,10 @@ def bridge_reports(
 
     Of a crossing in several files the newest result counts (see `newest_of_each`). The numbers of a
     bridge are those of the state with the newest crossing; if other files have good crossings of
-    its realm that are not in it, all are fused. `baseline` is a results file with which to compare;
-    otherwise the one that the site file names, whose folder is `beside` (default: that of the
-    results). `validations` is the folder of validation records. Raise InputError if a baseline does
-    not fit, or results do not fit their site file.
+    its realm that are not in it, all are fused. `baseline` is a results file with which to compare,
+    read or not; otherwise the one that the site file names, whose folder is `beside` (default: that
+    of the results). `validations` is the folder of validation records. Raise InputError if a
+    baseline does not fit, or results do not fit their site file.
     """
     for path, results, site in files:
         _check(path, results, site)
@@ -124,7 +130,7 @@ def _check(path: Path, results: Results, site: Site) -> None:
 def _report(
     name: str,
     files: Sequence[tuple[Path, Results, Site]],
-    baseline: Path | None,
+    baseline: Path | NamedResults | None,
     beside: Path | None,
     language: Language,
     validations: Path,

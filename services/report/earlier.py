@@ -9,10 +9,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from schemas.results import CrossingResult, load_results
+from schemas.results import CrossingResult, Results
 from schemas.site import Bridge
-from services.identification.comparison import Estimate
-from services.viewer.baseline import named_baseline, stored_baseline
+from services.identification.comparison import Estimate, estimate_of_state
+from services.ledger.baselines import read_baseline, state_in
+from services.viewer.baseline import named_baseline
 
 DAY_S = 86_400.0
 PAUSE_DAYS = 14.0
@@ -35,6 +36,13 @@ class Before(NamedTuple):
     """Number of crossings of the bridge that it does not include, whatever their verdict."""
 
 
+class NamedResults(NamedTuple):
+    """Results, and the name of their file."""
+
+    path: Path
+    results: Results
+
+
 class SurveyFile(NamedTuple):
     """The crossings of a bridge in one results file: its first and last entry in s since 1970."""
 
@@ -53,7 +61,7 @@ class CombinedSurveys(NamedTuple):
 
 
 def before_of(
-    bridge: Bridge, given: Path | None, results: Path, beside: Path | None
+    bridge: Bridge, given: Path | NamedResults | None, results: Path, beside: Path | None
 ) -> Before | None:
     """Return the baseline: the given one, or that of the site file."""
     if given is None:
@@ -62,15 +70,16 @@ def before_of(
             return None
         assert bridge.baseline is not None  # noqa: S101 - it was read
         given = folder / bridge.baseline
-    estimate, name = stored_baseline(bridge, given)
-    stored = load_results(given)
-    state = stored.bridges[bridge.id]
+    name, stored = given if isinstance(given, tuple) else (given, read_baseline(given))
+    state = state_in(name, stored, bridge)
     used = (one for one in stored.crossings if one.crossing_id in state.crossings_used)
     crossings = tuple(sorted(used, key=lambda crossing: crossing.entry_time))
     ids = frozenset(state.crossings_used)
     of_bridge = [one for one in stored.crossings if one.bridge == bridge.id]
     excluded = max(state.crossings_left_out_count, len(of_bridge) - len(crossings))
-    return Before(name, estimate, state.verdict or "good", crossings, ids, excluded)
+    return Before(
+        name.name, estimate_of_state(state), state.verdict or "good", crossings, ids, excluded
+    )
 
 
 def combined_surveys(

@@ -872,6 +872,26 @@ def test_report_of_a_fused_bridge_has_its_numbers(
     assert given.read_text() == of_found
 
 
+def test_report_of_a_comparison_shows_both_states(
+    found: driveby.Identification, tmp_path: Path
+) -> None:
+    """What `fuse` compared with is shown without being named once more; or another one instead."""
+    with pytest.warns(UserWarning, match="the same crossings"):
+        fused = driveby.fuse(found, baseline=found)
+    found.to_json(tmp_path / "then.json")
+    compared = {
+        "given to fuse": driveby.report(fused, output=tmp_path / "a.html"),
+        "fusion": driveby.report(found, baseline=fused, output=tmp_path / "b.html"),
+        "then.json": driveby.report(
+            fused, baseline=tmp_path / "then.json", output=tmp_path / "c.html"
+        ),
+    }
+    for name, page in compared.items():
+        assert f"<td>the baseline {name}: 1 crossing" in page.read_text()
+    alone = driveby.report(driveby.fuse(found), output=tmp_path / "d.html").read_text()
+    assert "<td>the baseline" not in alone
+
+
 @pytest.mark.slow
 def test_survey_is_that_of_the_command_line(
     tmp_path: Path, project: Path, capsys: pytest.CaptureFixture[str]
@@ -963,6 +983,24 @@ def test_prior_far_from_the_posterior_is_in_the_plot(found: driveby.Identificati
         assert prior_seen(axes) >= 0.2
         low, high = axes.get_xlim()
         assert low < beta.mean < high
+
+
+def test_draws_that_are_all_zero_are_drawn(found: driveby.Identification) -> None:
+    """As those of a torsion without any effect; a warning of Matplotlib would fail here."""
+    (solution,) = found.solutions
+    zero = dict.fromkeys(("mean", "std", "q025", "q50", "q975"), 0.0)
+    beta = solution.value["beta"].model_copy(update=zero)
+    for value in (beta, beta.model_copy(update={"prior": None})):
+        crossing = solution.crossing.model_copy(
+            update={"parameters": solution.value | {"beta": value}}
+        )
+        draws = solution.draws | {"beta": np.zeros_like(solution.draws["beta"])}
+        zeros = solution._replace(crossing=crossing, draws=draws)
+        (axes,) = driveby.plot_posterior(zeros, ["beta"]).axes
+        (posterior,) = axes.patches
+        low, high = axes.get_xlim()
+        assert low <= 0.0 < high
+        assert 0.0 < np.ptp(posterior.get_data().edges) < 0.1 * (high - low)
 
 
 def test_residual_has_a_band_of_its_expected_size(found: driveby.Identification) -> None:
