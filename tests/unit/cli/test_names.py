@@ -96,7 +96,7 @@ def test_inputs_with_names_that_are_no_text_are_read(
     assert "r\\udcff.mcap" in capsys.readouterr().out
     assert cli.main(["export", str(path), "--to", str(tmp_path / "out")]) == 0
     capsys.readouterr()
-    assert cli.main(["catalog", str(tmp_path)]) == 0
+    assert cli.main(["catalog", str(tmp_path)]) == 3
     assert "the name is not UTF-8; rename it" in capsys.readouterr().out
 
 
