@@ -1,6 +1,6 @@
 """The file of each message, names of files, and the limit of open ones."""
 
-from collections.abc import Container, Mapping
+from collections.abc import Callable, Container, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -29,7 +29,8 @@ class RecordingTarget(NamedTuple):
     folder: Path
     file: Path | None
     realm: str | None
-    site_toml: str | None
+    site_text: Callable[[], str] | None
+    """Reader of the site file, called for each new recording; None without one."""
 
     @property
     def top(self) -> Path:

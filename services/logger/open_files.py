@@ -219,11 +219,14 @@ class OpenFiles:
         latched: list[Message] | None = None,
     ) -> OpenFile:
         realm, vehicle = (self._place.realm, None) if name == ("", "") else name
+        read_site = self._place.site_text
         writer = RecordingWriter(
             path,
             reason=reason,
             origin=RecordingOrigin(
-                realm, None if vehicle == SERVICE_FILE else vehicle, self._place.site_toml
+                realm,
+                None if vehicle == SERVICE_FILE else vehicle,
+                None if read_site is None else read_site(),
             ),
             previous=previous,
             latched=latched or (),

@@ -113,7 +113,7 @@ def _check(asked: LoggerSettings, limits: RotationLimits) -> tuple[RecordingTarg
     if asked.file is not None and asked.budget_bytes is not None:
         raise InputError("--budget needs a folder of recordings, not --file")
     realms = _check_realms(asked.realms)
-    target = RecordingTarget(asked.folder, asked.file, single_realm(realms), _read_site(asked.site))
+    target = RecordingTarget(asked.folder, asked.file, single_realm(realms), _site_text(asked.site))
     _check_service(asked.service_id)
     check_speaks_for(asked.tls, "logger", asked.service_id)
     check_folder_writable(asked.written)
@@ -158,7 +158,7 @@ def _record(
     subscriptions = deque(
         Subscription(bus, f"{PREFIX}/{realm_chunk(realm)}/**") for realm in logger.realms
     )
-    if place.site_toml is None:
+    if place.site_text is None:
         _log.info("recordings will contain no site file (--site): `identify` will ask for one")
     try:
         if ready is not None:
@@ -396,14 +396,12 @@ def _check_service(service_id: str) -> None:
         raise InputError(f"service: {error}") from None
 
 
-def _read_site(site: Path | None) -> str | None:
+def _site_text(site: Path | None) -> Callable[[], str] | None:
     if site is None:
         return None
-    from schemas.site_file import parse_site, read_site_text
+    from services.logger.site_text import RecordedSite
 
-    text = read_site_text(site)
-    parse_site(text, str(site))
-    return text
+    return RecordedSite(site).current
 
 
 def _check_room(folder: Path, min_free_bytes: int) -> None:

@@ -380,7 +380,7 @@ def test_rotation_neither_loses_nor_repeats(
         "age": RotationLimits(age_s=0.1),
         "on request": RotationLimits(),
     }[why]
-    writer = FileWriter(RecordingTarget(tmp_path, None, None, "site = 1\n"), limits)
+    writer = FileWriter(RecordingTarget(tmp_path, None, None, lambda: "site = 1\n"), limits)
     sent: list[Message] = []
     for truck in ("truck-1", "truck-2"):
         writer.put(info(truck))

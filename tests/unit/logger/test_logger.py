@@ -132,7 +132,7 @@ def test_what_the_logger_says_itself_is_not_taken_twice() -> None:
 
 
 def place(folder: Path, file: Path | None = None) -> RecordingTarget:
-    return RecordingTarget(folder, file, None, "site = 1\n")
+    return RecordingTarget(folder, file, None, lambda: "site = 1\n")
 
 
 def messages(number: int, vehicle: str = "truck-1") -> list[Message]:
