@@ -136,7 +136,7 @@ class RealmModel:
     """
 
     def __init__(self, *, sees_trucks: bool = True, began_s: float = -math.inf) -> None:
-        self._sees_trucks = sees_trucks
+        self.sees_trucks = sees_trucks
         self.began_s = began_s
         self.trucks: dict[str, TruckRow] = {}
         self.crossings: dict[str, CrossingRow] = {}
@@ -216,7 +216,7 @@ class RealmModel:
     def _take_state(self, message: pb.Crossing, now_ns: int) -> str | None:
         truck = self.trucks.get(message.vehicle)
         lag_ns = 0 if truck is None else round(1e9 * truck.lag_s)
-        state = words_of_state(message, now_ns - lag_ns, sees_trucks=self._sees_trucks)
+        state = words_of_state(message, now_ns - lag_ns, sees_trucks=self.sees_trucks)
         row = self.crossings.get(message.crossing_id)
         if not state or (row is not None and (row.is_over or row.state == state)):
             return None

@@ -47,7 +47,7 @@ _MAX_BRIDGES: Final = 4
 NO_ALARM: Final = (
     "No alarm was received; it is not known here whether driveby alarm serve watches any bridge."
 )
-_HELD: Final = "waits for samples"
+_WAITS: Final = "waits for samples"
 """State of a crossing whose truck sends nothing before the crossing is decided."""
 _VERDICTS: Final = {"good": "green", "suspect": "yellow", "rejected": "red"}
 
@@ -102,8 +102,7 @@ def page(
             parts.append(Text(f"  and {len(trucks) - most_trucks} more", style="dim"))
     if rows:
         shown = rows[: max(3, room - most_trucks)]
-        driving = model.trucks.keys() - silent_trucks(model, now_s)
-        parts.append(_crossings(shown, driving, is_wide=is_wide))
+        parts.append(_crossings(shown, _held(model, now_s), is_wide=is_wide))
         if len(rows) > len(shown):
             parts.append(Text(f"  and {len(rows) - len(shown)} earlier", style="dim"))
     if model.bridges and not alarms:
@@ -242,12 +241,24 @@ def _wrong_time_notes(trucks: Sequence[tuple[str, TruckRow]], realm: str) -> lis
     ]
 
 
-def _crossings(rows: Sequence[CrossingRow], driving: Set[str], *, is_wide: bool) -> Table:
+def _held(model: RealmModel, now_s: float) -> frozenset[str]:
+    """Return the crossings whose truck sends no samples; none where its samples are not seen."""
+    if not model.sees_trucks:
+        return frozenset()
+    driving = model.trucks.keys() - silent_trucks(model, now_s)
+    return frozenset(
+        name
+        for name, row in model.crossings.items()
+        if row.state == ON_BRIDGE and row.vehicle not in driving
+    )
+
+
+def _crossings(rows: Sequence[CrossingRow], held: Set[str], *, is_wide: bool) -> Table:
     names = ("entry", "crossing", "", "EI", "lowest, of nominal (95 %)")
     table = _table(*names, *(["why"] if is_wide else []))
     for row in rows:
-        is_held = row.state == ON_BRIDGE and row.vehicle not in driving
-        state = Text(_HELD if is_held else row.state, style=_VERDICTS.get(row.state, ""))
+        words = _WAITS if row.crossing_id in held else row.state
+        state = Text(words, style=_VERDICTS.get(row.state, ""))
         if row.fraction is not None and not row.is_over:
             state.append(f" {100.0 * row.fraction:.0f} %")
         why = Text(row.reason, style="dim")

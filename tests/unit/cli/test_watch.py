@@ -133,6 +133,17 @@ def test_without_trucks_data_no_crossing_is_from_a_recording() -> None:
         assert found.endswith(f": {words}")
 
 
+def test_page_and_line_of_a_viewer_name_a_state_alike() -> None:
+    """Without trucks' data it is unknown whether a truck sends samples."""
+    watched = RealmModel(sees_trucks=False)
+    for name, entry, words in (("a", 0.0, "detected"), ("b", 595.0, "on the bridge")):
+        printed = deliver(watched, state(name, pb.DETECTED, "truck-1", entry))
+        assert printed is not None
+        assert printed.endswith(f": {words}")
+    rows = [one.rstrip() for one in drawn(watched) if "→ bridge-1" in one]
+    assert [one.split("bridge-1")[1].strip() for one in rows] == ["on the bridge", "detected"]
+
+
 def test_credentials_that_show_trucks(credentials: Path) -> None:
     assert sees_trucks(None, "live")
     assert sees_trucks(credentials / "worker", "live")
