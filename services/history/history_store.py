@@ -27,6 +27,7 @@ from schemas.topics import check_identifier, check_realm
 from services.common.errors import InputError
 from services.common.files import make_folder, write_atomically
 from services.common.parquet_files import FILES, arrow, decoded, encoded
+from services.history.add_summary import AddSummary, CrossingKey
 
 if TYPE_CHECKING:
     # Kernels are slow to import, and reading a table needs none.
@@ -94,15 +95,6 @@ class BridgeRows(NamedTuple):
     """Files that are unreadable, or in part, one line each."""
 
 
-class AddSummary(NamedTuple):
-    """Summary of adding results."""
-
-    crossings: int
-    known: int
-    """Number of crossings that were stored already."""
-    bridges: tuple[str, ...]
-
-
 def add_results(
     folder: Path, results: Results, temperatures: "Mapping[str, float] | None" = None
 ) -> AddSummary:
@@ -123,17 +115,22 @@ def add_results(
     header = ResultHeader(
         results.version, results.created, results.site_hash, results.settings, results.seed
     )
-    added, bridges = 0, []
+    added, replaced = set[CrossingKey](), set[CrossingKey]()
     for (realm, bridge), some in sorted(by_bridge.items()):
         where = partition(folder, realm, bridge)
-        there = _contents(where)
+        there, newest = _stored(where)
         new = [history_row(one, header, (temperatures or {}).get(one.crossing_id)) for one in some]
         new = [one for one in new if one.content not in there]
         if new:
             write_batch(where, new)
-            added += len(new)
-            bridges.append(bridge)
-    return AddSummary(added, len(results.crossings) - added, tuple(bridges))
+        for one in new:
+            before = newest.get(one.crossing_id)
+            if before is None or before < _rank(one):
+                (added if before is None else replaced).add((realm, bridge, one.crossing_id))
+                newest[one.crossing_id] = _rank(one)
+    known = {(one.realm, one.bridge, one.crossing_id) for one in results.crossings}
+    replaced -= added
+    return AddSummary(frozenset(added), frozenset(replaced), frozenset(known - added - replaced))
 
 
 def partition(folder: Path, realm: str, bridge: str) -> Path:
@@ -187,9 +184,14 @@ def _rank(row: HistoryRow) -> tuple[float, bool, str]:
     return row.created_s, row.temperature_deg_c is not None, row.content
 
 
-def _contents(where: Path) -> set[str]:
-    """Return the hashes of all readable results of a bridge, also of older ones."""
-    return {row.content for path in sorted(where.glob(FILES)) for row in _rows(path)[0]}
+def _stored(where: Path) -> tuple[set[str], dict[str, tuple[float, bool, str]]]:
+    """Return the hashes of all readable results, and the rank of each crossing's newest one."""
+    contents, newest = set[str](), dict[str, tuple[float, bool, str]]()
+    for path in sorted(where.glob(FILES)):
+        for row in _rows(path)[0]:
+            contents.add(row.content)
+            newest[row.crossing_id] = max(_rank(row), newest.get(row.crossing_id, _rank(row)))
+    return contents, newest
 
 
 def _rows(path: Path, columns: list[str] | None = None) -> tuple[list[HistoryRow], list[str]]:

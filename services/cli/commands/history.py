@@ -123,25 +123,27 @@ def _add_one(
     options: HistoryOptions, path: Path, some: "Iterable[Results]", driven: "set[HistoryEntry]"
 ) -> str:
     """Add a file or a folder, record the positions of its crossings, and return a summary."""
+    from services.history.add_summary import summed
     from services.history.bridge_history import HistoryEntry
     from services.history.history_store import add_results
     from services.history.temperatures import temperatures_of
 
-    new, there, warm, bridges = 0, 0, 0, set[str]()
+    parts, warm = [], set[str]()
     for results in some:
         known = {}
         if options.temperature is not None:
             known = temperatures_of(options.temperature, results.crossings)
-        added = add_results(options.history, results, known)
-        new, there, warm = new + added.crossings, there + added.known, warm + len(known)
-        bridges.update(added.bridges)
+        parts.append(add_results(options.history, results, known))
+        warm.update(known)
         driven.update(
             HistoryEntry(one.realm, one.bridge, one.entry_time) for one in results.crossings
         )
-    of = f" of {', '.join(sorted(bridges))}" if bridges else ""
-    before = f", {there} there already" if there else ""
-    beside = f", {warm} with a temperature" if options.temperature is not None else ""
-    return f"{path}: {count_of(new, 'crossing')}{of} added{before}{beside}"
+    total = summed(parts)
+    of = f" of {', '.join(total.bridges)}" if total.bridges else ""
+    newer = f", {len(total.replaced)} replaced" if total.replaced else ""
+    before = f", {len(total.known)} there already" if total.known else ""
+    beside = f", {len(warm)} with a temperature" if options.temperature is not None else ""
+    return f"{path}: {count_of(len(total.added), 'crossing')}{of} added{newer}{before}{beside}"
 
 
 def _table(options: HistoryOptions) -> int:

@@ -150,6 +150,31 @@ def test_folder_of_workers_is_added(
     assert line.startswith(f"{torn}: ")
 
 
+@pytest.mark.parametrize("is_newer_first", [False, True])
+def test_add_counts_a_crossing_of_two_site_files_once(
+    tmp_path: Path,
+    found: list[CrossingResult],
+    is_newer_first: bool,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A worker continues with an edited site file; a later run identifies the crossings again."""
+    folder = tmp_path / "live"
+    folder.mkdir()
+    headers = [HEADER, ENDED._replace(site_hash="2" * 64)]
+    for number, header in enumerate(reversed(headers) if is_newer_first else headers):
+        path = folder / f"results-20260827T10000{number}Z.json"
+        path.write_text(results_json(results(header, found, {})))
+    assert add(folder, tmp_path) == 0
+    later = tmp_path / "later.json"
+    third = ENDED._replace(site_hash="3" * 64, created=ENDED.created + 1.0)
+    later.write_text(results_json(results(third, found[1:], {})))
+    assert add(later, tmp_path) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"{folder}: 4 crossings of bridge-1 added",
+        f"{later}: 0 crossings of bridge-1 added, 3 replaced",
+    ]
+
+
 def test_list_of_alarms_of_a_single_bridge(
     tmp_path: Path, into: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -18,6 +18,7 @@ from services.cli import main as cli
 from services.common.errors import InputError
 from services.common.parquet_files import encoded
 from services.history import history_store
+from services.history.add_summary import AddSummary
 from services.history.history_store import (
     add_results,
     fusable_of,
@@ -60,14 +61,18 @@ def files(folder: Path) -> list[Path]:
     return sorted(folder.rglob("*.parquet"))
 
 
+def counts(of: AddSummary) -> tuple[int, int, int, tuple[str, ...]]:
+    return len(of.added), len(of.replaced), len(of.known), of.bridges
+
+
 def test_what_is_added_is_there_and_adding_it_again_changes_nothing(tmp_path: Path) -> None:
     some = crossings(3)
-    assert add_results(tmp_path, some) == (3, 0, ("bridge-1",))
+    assert counts(add_results(tmp_path, some)) == (3, 0, 0, ("bridge-1",))
     before = {path: path.read_bytes() for path in files(tmp_path)}
     assert len(before) == 1
-    assert add_results(tmp_path, some) == (0, 3, ())
+    assert counts(add_results(tmp_path, some)) == (0, 0, 3, ())
     more = some.model_copy(update={"crossings": (*some.crossings, *crossings(5).crossings[3:])})
-    assert add_results(tmp_path, more) == (2, 3, ("bridge-1",))
+    assert counts(add_results(tmp_path, more)) == (2, 0, 3, ("bridge-1",))
     after = {path: path.read_bytes() for path in files(tmp_path)}
     assert before.items() <= after.items()
     kept = read_partition(where(tmp_path), ("likelihood", "observation")).crossings
@@ -93,7 +98,10 @@ def test_of_two_results_of_a_crossing_the_newer_one_counts(tmp_path: Path) -> No
         }
     )
     add_results(tmp_path, newer)
-    add_results(tmp_path, some)
+    assert counts(add_results(tmp_path, some)) == (0, 0, 2, ())
+    newest = newer.model_copy(update={"created": some.created + 2.0})
+    newest = newest.model_copy(update={"site_hash": "2" * 64})
+    assert counts(add_results(tmp_path, newest)) == (0, 2, 0, ("bridge-1",))
     kept = read_partition(where(tmp_path)).crossings
     assert [one.chi2_per_dof for one in kept] == [1.5, 1.5]
 
@@ -171,7 +179,7 @@ def test_damaged_files_and_other_editions_get_a_line_and_stay(
     assert len(read.problems) == 3
     # What is lost is added again; what cannot be read is never removed.
     monkeypatch.setattr(history_store, "_MAX_FILES", 0)
-    assert add_results(tmp_path, some).crossings == 2
+    assert len(add_results(tmp_path, some).added) == 2
     assert len(read_partition(where(tmp_path)).crossings) == 4
     assert torn.exists()
     assert noise.exists()
@@ -440,7 +448,8 @@ def test_what_is_lost_is_written_beside_the_damaged_file_that_has_its_name(tmp_p
     torn = path.read_bytes()[:-100]
     path.write_bytes(torn)
     for count in (3, 0):
-        assert add_results(tmp_path, some) == (count, 3 - count, ("bridge-1",) if count else ())
+        bridges = ("bridge-1",) if count else ()
+        assert counts(add_results(tmp_path, some)) == (count, 0, 3 - count, bridges)
         read = read_partition(where(tmp_path))
         assert len(read.crossings) == 3
         assert len(read.problems) == 1
