@@ -148,7 +148,7 @@ def _why_not_connected(endpoint: str, timeout_s: float | None, tls: Path | None)
         return f"no router answers at {endpoint}{within}: {cause}"
     return (
         f"no router answers at {endpoint}{within}; "
-        "start `driveby logger` first or give another endpoint"
+        "start `driveby logger` first or give its address with --endpoint"
     )
 
 

@@ -21,6 +21,15 @@ def test_silent_service_is_named_with_its_realm(endpoint: str) -> None:
     )
 
 
+def test_unreachable_address_names_the_option_for_another(endpoint: str) -> None:
+    with pytest.raises(FailureError) as caught:
+        health_command(service="logger", endpoint=endpoint, tls=None, realm="live", patience_s=0.5)
+    assert str(caught.value) == (
+        f"no router answers at {endpoint} within 0.5 s; start `driveby logger` first or give its "
+        "address with --endpoint"
+    )
+
+
 def test_silence_with_credentials_names_the_list(credentials: Path, tls_endpoint: str) -> None:
     tls = credentials / "viewer"
     with (
