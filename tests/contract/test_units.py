@@ -78,6 +78,13 @@ def test_health_unit_queries_logger_and_worker() -> None:
         assert options.tls == Path("/etc/driveby/tls/viewer")
 
 
+def test_health_unit_names_the_option_of_another_address() -> None:
+    text = UNITS["health"].read_text()
+    (shown,) = re.findall(r"^# .*\badd `(--endpoint \S+)` .*to BUS", text, re.MULTILINE)
+    options = cli._parser().parse_args(["health", "logger", *shown.split()])
+    assert options.endpoint == "tcp/HOST:PORT"
+
+
 def test_night_unit_runs_the_script_with_its_arguments() -> None:
     service = unit("night")["Service"]
     shell, script, *arguments = shlex.split(service["ExecStart"])
