@@ -10,12 +10,16 @@ from pathlib import Path
 
 import pytest
 
+from services.bus.playback import DELIVERY_TIMEOUT_S
 from services.cli import main as cli
 from services.cli.table import name_of
+from services.common.errors import InputError
 
 ROOT = Path(__file__).parents[2]
 UNITS = {path.stem.removeprefix("driveby-"): path for path in (ROOT / "deploy").glob("*.service")}
 SERVICES = ("logger", "worker")
+TRUCK = "truck"
+"""Unit of a truck's computer, which needs no file of options."""
 JOBS = ("health", "night")
 """Units that a timer starts."""
 PROGRAM = "/opt/driveby/bin/driveby"
@@ -56,7 +60,7 @@ def unit(name: str) -> ConfigParser:
 
 
 def test_services_and_jobs_have_units() -> None:
-    assert set(UNITS) == {*SERVICES, *JOBS}
+    assert set(UNITS) == {*SERVICES, TRUCK, *JOBS}
 
 
 @pytest.mark.parametrize("name", JOBS)
@@ -66,6 +70,28 @@ def test_timer_starts_its_job(name: str) -> None:
     assert "WantedBy=timers.target" in timer
     assert unit(name)["Service"]["Type"] == "oneshot"
     assert f"enable --now driveby-{name}.timer" in UNITS[name].read_text()
+
+
+def test_truck_unit_starts_the_gateway_with_a_spool() -> None:
+    service, text = unit(TRUCK)["Service"], UNITS[TRUCK].read_text()
+    program, *arguments, bus = shlex.split(service["ExecStart"])
+    assert (program, bus) == (PROGRAM, "$BUS")
+    (shown,) = re.findall(r'Environment="BUS=(.+)"', text)
+    options = cli._parser().parse_args([*arguments, *shown.split()])
+    assert name_of(options) == "gateway"
+    assert (options.spool, options.endpoint) == (Path("spool"), "tls/HOST:7447")
+    assert options.site == Path("/etc/driveby/site.toml")
+    assert options.tls == Path(f"/etc/driveby/tls/{TRUCK}")
+    # By default the bus would be the router of ROS.
+    with pytest.raises(InputError, match="--endpoint: expected one argument"):
+        cli._parser().parse_args(arguments)
+    assert f"`cp -r certs/truck-1 /etc/driveby/tls/{TRUCK}`" in text
+    assert service["WorkingDirectory"] == f"/var/lib/{service['StateDirectory']}"
+    assert service["RestartPreventExitStatus"] == str(cli.EXIT_BAD_INPUT)
+    assert int(service["TimeoutStopSec"]) > DELIVERY_TIMEOUT_S
+    # A truck without a network starts, too.
+    assert "network-online.target" not in text
+    assert f"(../deploy/driveby-{TRUCK}.service)" in (ROOT / "docs/install.md").read_text()
 
 
 def test_health_unit_queries_logger_and_worker() -> None:
@@ -115,7 +141,8 @@ def test_installation_places_credentials_where_the_options_expect_them() -> None
     installed = (ROOT / "docs/install.md").read_text()
     (copied,) = re.findall(r"`cp -r (.*?) /etc/driveby/tls`", installed)
     places = {f"/etc/driveby/tls/{Path(one).name}" for one in copied.split()}
-    named = "".join(path.read_text() for path in sorted((ROOT / "deploy").iterdir()))
+    on_server = set((ROOT / "deploy").iterdir()) - {UNITS[TRUCK]}
+    named = "".join(path.read_text() for path in sorted(on_server))
     assert set(re.findall(r"/etc/driveby/tls/\w+", named)) == places
 
 
