@@ -137,6 +137,18 @@ def test_installation_is_one_numbered_list_to_which_the_units_refer() -> None:
         assert "useradd" not in text
 
 
+def test_uninstallation_removes_everything_but_the_data() -> None:
+    page = (ROOT / "docs/install.md").read_text()
+    (line,) = [one for one in page.splitlines() if "`systemctl disable --now" in one]
+    (removed,) = re.findall(r"`rm -rf (.*?)`", line)
+    installed = {"/opt/driveby", "/etc/driveby", "/etc/systemd/system/driveby-*"}
+    caches = {unit(name)["Service"].get("CacheDirectory") for name in UNITS} - {None}
+    assert set(removed.split()) == installed | {f"/var/cache/{name}" for name in caches}
+    assert "`systemctl daemon-reload`" in line
+    for name in {unit(name)["Service"]["User"] for name in UNITS}:
+        assert f"`userdel {name}`" in line
+
+
 def test_installation_places_credentials_where_the_options_expect_them() -> None:
     installed = (ROOT / "docs/install.md").read_text()
     (copied,) = re.findall(r"`cp -r (.*?) /etc/driveby/tls`", installed)
