@@ -95,6 +95,8 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     clear = percent(CLEAR_LOSS)
     yield f"clearly less stiff only if its whole 95 % interval is more than {clear} below"
     yield "the others or the baseline, which takes a larger loss or more crossings"
+    yield f"two surveys of {question.crossings} crossings compared: √2 times the ± of one, so each"
+    yield "needs at least twice the crossings stated here, and more for a clear change"
     yield ""
     yield from _aligned(_comparison(found))
     yield f"after {question.crossings} crossings; overall, mid: standard deviations of the overall"

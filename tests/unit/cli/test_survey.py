@@ -241,3 +241,9 @@ def test_picture_names_bridge_truck_and_threshold() -> None:
     legend = figure.axes[0].get_legend()
     assert legend is not None
     assert "95 %" in [text.get_text() for text in legend.get_texts()]
+
+
+def test_forecast_says_what_a_comparison_of_two_surveys_takes() -> None:
+    text = " ".join(lines_of(made_up(9, {})))
+    assert "two surveys of 12 crossings compared: √2 times the ± of one" in text
+    assert "so each needs at least twice the crossings stated here" in text
