@@ -72,9 +72,10 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     yield f"{vehicle.id} ({tonnes:.1f} t, {tyres_of(planned)}) over {bridge.id}"
     yield (
         f"({bridge.span_m:g} m, {bridge.elements} elements), road of class "
-        f"{found.road.road_class}, {question.crossings} crossings at {speeds[0]:.1f} to "
-        f"{speeds[-1]:.1f} m/s"
+        f"{found.road.road_class}, {question.crossings} crossings"
     )
+    halves = ", ".join(f"half at {speed:.1f} m/s" for speed in speeds)
+    yield f"assumed speeds, whatever the feasible ones: {halves}"
     if found.road.is_surface:
         yield mismatch_in_words(found)
     false = percent(FALSE_ALARM)

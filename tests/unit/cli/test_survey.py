@@ -247,3 +247,11 @@ def test_forecast_says_what_a_comparison_of_two_surveys_takes() -> None:
     text = " ".join(lines_of(made_up(9, {})))
     assert "two surveys of 12 crossings compared: √2 times the ± of one" in text
     assert "so each needs at least twice the crossings stated here" in text
+
+
+def test_forecast_prints_the_speeds_it_assumes() -> None:
+    text = "\n".join(lines_of(made_up(9, {})))
+    assert "road of class A, 12 crossings\n" in text
+    assert (
+        "\nassumed speeds, whatever the feasible ones: half at 8.5 m/s, half at 11.5 m/s\n" in text
+    )
