@@ -133,6 +133,11 @@ class Element(NamedTuple):
         return self.is_comparable and self.high < 1.0 and not self.is_weak
 
     @property
+    def is_higher(self) -> bool:
+        """Whether its interval excludes zero gain, and its stiffness is still plausible."""
+        return self.is_comparable and self.low > 1.0 and not self.is_implausible
+
+    @property
     def is_implausible(self) -> bool:
         """Whether it is stiffer than damage, weather and chance explain."""
         return self.is_comparable and self.low > 1.0 + IMPLAUSIBLE_GAIN
@@ -167,6 +172,13 @@ class Comparison(NamedTuple):
     def lower(self) -> tuple[Element, ...]:
         """Elements that have lost stiffness, but not clearly."""
         return tuple(element for element in self.elements if element.is_lower)
+
+    @property
+    def risen(self) -> tuple[Element, ...]:
+        """Elements stiffer than a baseline; without one they may simply be built so."""
+        if self.reference == "others":
+            return ()
+        return tuple(element for element in self.elements if element.is_higher)
 
     @property
     def implausible(self) -> tuple[Element, ...]:

@@ -62,6 +62,7 @@ def cautions(measured: CautionBasis, language: Language) -> Iterator[str]:
         yield from _implausible(comparison, language)
         yield from _implausible_before(measured, language)
         yield from _lower(measured.view, comparison, language)
+        yield from _higher(comparison, language)
         if comparison.weak or 2 * len(measured.view.vague) <= len(comparison.elements):
             limit = 100.0 * CLEAR_LOSS
             yield language.text(f"caution.clearly.{comparison.reference}", limit=limit)
@@ -144,7 +145,26 @@ def _implausible_before(measured: CautionBasis, language: Language) -> Iterator[
 def _lower(view: BridgeView, comparison: Comparison, language: Language) -> Iterator[str]:
     elements = possibly_weak(view)
     if elements:
-        listed = [
+        yield language.choice(
+            "caution.lower",
+            len(elements),
+            elements=_changes(elements, language),
+            limit=100.0 * CLEAR_LOSS,
+        )
+
+
+def _higher(comparison: Comparison, language: Language) -> Iterator[str]:
+    """Yield the usual causes where elements are stiffer than the baseline."""
+    elements = comparison.risen
+    if elements:
+        listed = _changes(elements, language)
+        yield language.choice("caution.higher", len(elements), elements=listed)
+
+
+def _changes(elements: Sequence[Element], language: Language) -> str:
+    """Return a list of elements with their changes and intervals."""
+    return language.listed(
+        [
             language.text(
                 "caution.change",
                 number=one.number,
@@ -152,12 +172,7 @@ def _lower(view: BridgeView, comparison: Comparison, language: Language) -> Iter
             )
             for one in elements
         ]
-        yield language.choice(
-            "caution.lower",
-            len(elements),
-            elements=language.listed(listed),
-            limit=100.0 * CLEAR_LOSS,
-        )
+    )
 
 
 def _earlier(measured: CautionBasis, language: Language) -> Iterator[str]:

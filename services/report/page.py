@@ -28,7 +28,7 @@ from services.viewer.drawing import STYLE, figure_bytes
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 _TAG = re.compile(r"<[^>]*>")
-_DOUBTFUL = ("weak", "stiff", "implausible", "lower")
+_DOUBTFUL = ("weak", "stiff", "implausible", "lower", "higher")
 """Remarks that a doubtful measurement cannot make."""
 
 
@@ -267,6 +267,8 @@ def _remark(
         return "unresolved_before"
     if number in earlier:
         return "earlier"
+    if view.comparison is not None and element in view.comparison.risen:
+        return "higher"
     return "lower" if element is not None and element.is_lower else ""
 
 

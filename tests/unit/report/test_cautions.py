@@ -100,6 +100,20 @@ def test_gain_against_a_baseline_is_implausible_without_repair(site: Site, then:
     assert "plausible" not in first_page(reported(site, changed(site, 1.1), baseline=then))
 
 
+def test_rise_against_a_baseline_has_a_remark_and_likely_causes(site: Site, then: Path) -> None:
+    text = first_page(reported(site, changed(site, 1.12), baseline=then))
+    assert re.search(r"4\.3–8\.6 .{,80} possibly stiffer", text)
+    assert "Stiffer than the baseline: element 2 (+12 %, 95 % interval +" in text
+    assert "Unless it was repaired, the usual cause is a bearing that is restrained" in text
+    clear = first_page(reported(site, changed(site, 1.22), baseline=then))
+    assert "Stiffer than the baseline: element 2" in clear
+    assert re.search(r"4\.3–8\.6 .{,80} stiffer", clear)
+    # Without a baseline an element may simply be built so.
+    alone = first_page(reported(site, changed(site, 1.12)))
+    assert "Stiffer than the baseline" not in alone
+    assert "possibly stiffer" not in alone
+
+
 def test_implausible_baseline_takes_certainty_from_changes(site: Site, tmp_path: Path) -> None:
     """A survey that found element 5 twice as stiff as the others is no measure of its loss."""
     ratios = RATIOS.copy()
