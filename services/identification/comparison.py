@@ -326,7 +326,7 @@ def describe_comparison(
         wordings.append(_not_resolved("unresolved_before", count, before, language))
     resolved = tuple(e for e in found.rest if e.number not in every)
     if resolved and "visible" not in without:
-        wordings.append(language.text("rest.resolved", loss=_smallest_seen(resolved)))
+        wordings.append(_smallest_seen("rest.resolved", resolved, language))
     if level is not None:
         wordings.append(describe_level(level, language))
     return wordings
@@ -387,13 +387,21 @@ def sentences(
         which = "rest" if wordings else "all"
         wordings.append(language.text(f"{which}.{found.reference}", within=within))
         if "visible" not in without:
-            wordings.append(language.text("rest.visible", loss=_smallest_seen(found.rest)))
+            wordings.append(_smallest_seen("rest.visible", found.rest, language))
     return wordings
 
 
-def _smallest_seen(elements: Sequence[Element]) -> int:
-    """Return the loss in per cent that would have been clear in each of the elements."""
-    return per_cent_up(max(element.visible_loss for element in elements))
+def _smallest_seen(key: str, elements: Sequence[Element], language: Language) -> str:
+    """Return the sentence on the loss that would have been clear in each of the elements.
+
+    Ends are often known far worse than the rest: where losses differ, both are named.
+    """
+    worst = max(elements, key=lambda element: element.visible_loss)
+    best = min(elements, key=lambda element: element.visible_loss)
+    low, high = per_cent_up(best.visible_loss), per_cent_up(worst.visible_loss)
+    if low == high:
+        return language.text(key, loss=high)
+    return language.text("rest.range", low=low, best=best.number, high=high, worst=worst.number)
 
 
 def per_cent_up(share: float) -> int:

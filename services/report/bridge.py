@@ -308,13 +308,15 @@ def _finding(
         headline = language.choice("finding.known", len(known), elements=language.listed(known))
         seen = () if missed is None else tuple(_seen(view.comparison, language))
         kind = "known" if missed is None and not but else "open"
-        return BridgeFinding(kind, headline + but, (*wording, *seen))
+        without: tuple[Stated, ...] = ("visible",) if seen else ()
+        described = describe_bridge(view, language, without)
+        return BridgeFinding(kind, headline + but, (*described, *single, *seen))
     if missed is None:
         kind = "open" if but else "sound"
         return BridgeFinding(kind, language.text("finding.none") + but, wording)
     # The headline names the unresolved elements unless they are most of them.
     are_named = 2 * len(view.vague) <= len(view.comparison.elements)
-    without: tuple[Stated, ...] = ("visible", "unresolved") if are_named else ("visible",)
+    without = ("visible", "unresolved") if are_named else ("visible",)
     described = describe_bridge(view, language, without)
     sentences = (*described, *single, *_seen(view.comparison, language))
     return BridgeFinding("open", missed + but, sentences)

@@ -237,3 +237,19 @@ def test_unresolved_elements_are_never_stated_to_agree() -> None:
     assert both[1] == "The loss may also be in element 3 or 5; these are adjacent."
     every = describe_comparison(sound, frozenset(range(1, 8)))
     assert every == ["No single element is resolved (standard deviation above 25 %)."]
+
+
+def test_loss_that_would_show_names_the_elements_it_holds_for() -> None:
+    now = estimate(np.ones(5))
+    spread = np.exp(1.96 * np.array([0.2, 0.03, 0.02, 0.03, 0.1]))
+    wide = now._replace(low=now.mean / spread, high=now.mean * spread)
+    then = estimate(np.ones(5), relative=0.01)
+    found = compare(wide, NOMINAL[:5], np.linspace(0.0, 30.0, 6), then)
+    by_hand = [1.0 - 0.9 * np.exp(-1.96 * np.hypot(of, 0.01)) for of in (0.02, 0.2)]
+    low, high = (int(np.ceil(100.0 * one)) for one in by_hand)
+    sentence = (
+        f"The smallest loss that would show ranges from {low} % (element 3) to {high} % "
+        "(element 1)."
+    )
+    assert sentences(found)[-1] == sentence
+    assert describe_comparison(found, frozenset({1}))[-1].endswith("(element 5).")

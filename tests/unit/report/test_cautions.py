@@ -114,6 +114,12 @@ def test_rise_against_a_baseline_has_a_remark_and_likely_causes(site: Site, then
     assert "possibly stiffer" not in alone
 
 
+def test_finding_states_once_which_losses_would_show(site: Site, then: Path) -> None:
+    text = first_page(reported(site, fused(site, [0.2, *KNOWN[1:]]), baseline=then))
+    assert "No clear change; element 4 is still less stiff than the others." in text
+    assert len(re.findall(r"ranges from \d+ % \(element \d\) to \d+ % \(element 1\)", text)) == 1
+
+
 def test_implausible_baseline_takes_certainty_from_changes(site: Site, tmp_path: Path) -> None:
     """A survey that found element 5 twice as stiff as the others is no measure of its loss."""
     ratios = RATIOS.copy()
