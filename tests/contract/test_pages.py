@@ -74,3 +74,12 @@ def test_version_is_the_same_everywhere() -> None:
     citation = (ROOT / "CITATION.cff").read_text()
     assert f"\nversion: {project['version']}\n" in citation
     assert f"\nlicense: {project['license']}\n" in citation
+
+
+def test_table_of_checks_names_what_alike_axles_do_to_a_crossing() -> None:
+    """`wrong` alone leaves open whether the crossings of such a truck count."""
+    page = (ROOT / "docs/survey.md").read_text()
+    (row,) = re.findall(r"^\| axle loads \|.*", page, re.MULTILINE)
+    assert "(verdicts.md#after-a-fit)" in row
+    assert "`axles_alike`" in row
+    assert "not fused" in row
