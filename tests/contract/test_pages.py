@@ -83,3 +83,10 @@ def test_table_of_checks_names_what_alike_axles_do_to_a_crossing() -> None:
     assert "(verdicts.md#after-a-fit)" in row
     assert "`axles_alike`" in row
     assert "not fused" in row
+
+
+def test_guide_links_comparison_and_realms_where_results_are_made() -> None:
+    guide = (ROOT / "docs/engineer.md").read_text()
+    step = guide.partition("## 5. Identify")[2].partition("\n## ")[0]
+    assert "(survey.md#comparison-a-year-later)" in step
+    assert "(contract.md#csv-import)" in step
