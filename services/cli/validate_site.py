@@ -23,9 +23,9 @@ from services.common.naming import count_of, processes_in_words
 from services.common.progress import progress_bar, start_line
 from services.common.truck_choice import TRUCK_CHOICES, truck_to_try
 from services.history.validation_files import save
+from services.simulation.trial_truth import CROSSINGS
 from services.simulation.validation_options import CertificateOptions
 from services.simulation.validation_trial import (
-    CROSSINGS,
     ValidationTrial,
     conditions_of,
     run_trial,

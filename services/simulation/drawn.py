@@ -164,8 +164,11 @@ class IdentifiedCrossing(NamedTuple):
     """Posterior draws (n,) by the names of docs/contract.md; None where a method has none."""
 
 
-def draw_truth(site: Site, seed: int) -> CrossingTruth:
-    """Draw everything that the site's priors and the conditions above leave open."""
+def draw_truth(site: Site, seed: int, mass_score: float | None = None) -> CrossingTruth:
+    """Draw everything that the site's priors and the conditions above leave open.
+
+    `mass_score`, where given, is the standard score of the total mass, which is then not drawn.
+    """
     rng = np.random.default_rng(np.random.SeedSequence([seed, 0x7247]))
     vehicle, bridge = site.vehicles[0], site.bridges[0]
 
@@ -178,6 +181,9 @@ def draw_truth(site: Site, seed: int) -> CrossingTruth:
 
     known = [key for key in _DRAWN_FIRST if getattr(vehicle, key) is not None]
     values = {key: of_truck(key) for key in known}
+    if mass_score is not None:
+        spread = vehicle.spread("total_mass_kg")
+        values["total_mass_kg"] = vehicle.total_mass_kg * float(np.exp(spread * mass_score))
     ei_spread = bridge.spread("flexural_rigidity_nm2")
     ratios = np.exp(ei_spread * rng.standard_normal(bridge.elements))
     beam = beam_of(bridge, ratios)

@@ -2,10 +2,11 @@
 
 Before real crossings of a pair of vehicle and bridge count, simulated ones of this very pair are
 identified as a worker would identify them, and the answers compared with the truth. Truck, bridge,
-sensors and receiver are those of the site file, all unknown values drawn from its priors, with its
-own survey speed and a road of its class; a 2-D surface where the site file describes tyres on
-different wheel paths. In every third crossing the bridge is undamaged except for one element of
-half its rigidity, so that the trial includes what is to be detected.
+sensors and receiver are those of the site file, all unknown values drawn from its priors (total
+masses are the medians of the twelfths of theirs), with its own survey speed and a road of its
+class; a 2-D surface where the site file describes tyres on different wheel paths. In every third
+crossing the bridge is undamaged except for one element of half its rigidity, so that the trial
+includes what is to be detected.
 
 `judge_trial` is the rule (studies/site-validation.md; studies/scripts/certificate_rates.py computes
 its error rates). It judges crossings in the order of their seeds, so one seed gives one record.
@@ -38,15 +39,13 @@ from services.common.errors import FailureError
 from services.drives.runs import Run
 from services.finding.placed import middle_sensor, middle_site
 from services.recordings.recording import program_version
-from services.simulation.drawn import CrossingTruth, draw_truth, drive, identify_simulated
+from services.simulation.drawn import CrossingTruth, drive, identify_simulated
 from services.simulation.drawn_tandem import drawn_tandem
-from services.simulation.drive import beam_of
-from services.simulation.wheel_paths import WANDER_M, SurfaceOptions, wheel_paths_of
+from services.simulation.trial_truth import CROSSINGS, drawn_truth
 
 _log = logging.getLogger(__name__)
 
 SEED: Final = 1
-CROSSINGS: Final = 12
 FEWEST: Final = 8
 """Fewest crossings after which a trial without objection may pass."""
 FEWEST_GOOD: Final = 8
@@ -57,15 +56,12 @@ LARGEST_Z_GOOD: Final = 5.0
 SURE_COVERAGE: Final = 0.93
 SURE_RMS_Z: Final = 1.2
 """Largest RMS score at which `FEWEST` crossings, all good, suffice."""
-WEAK_RATIO: Final = 0.5
 TAKEN_FOR_SOUND: Final = 0.75
 """Lower end of the interval of a weak element above which its loss counts as missed."""
 FOUND_BELOW: Final = 0.9
 _SPEED_M_PER_S: Final = 10.0
 _ROAD_CLASS: Final = "B"
 """Road class where the site file has none."""
-_STEADY_M_PER_S2: Final = 0.1
-"""Largest change of speed: a survey is driven evenly."""
 _SEEDS: Final = 1000
 """Distance of the crossings' seeds between two seeds of trials."""
 _ALL_SEEDS: Final = 1 << 63
@@ -258,34 +254,6 @@ def _not_simulated(site: Site, seed: int) -> ValidationCrossing:
     return ValidationCrossing(
         seed=seed, direction="start_to_end", ei_ratio=(1.0,) * elements, verdict="not_simulated"
     )
-
-
-def drawn_truth(
-    site: Site, conditions: ValidationConditions, seed: int, number: int
-) -> tuple[CrossingTruth, int | None]:
-    """Return the truth of a crossing, and the index of its weak element, if any."""
-    vehicle, bridge = site.vehicles[0], site.bridges[0]
-    truth = draw_truth(site, seed)
-    how = truth.conditions
-    truth = truth._replace(
-        conditions=how._replace(
-            road_class=conditions.road_class,
-            speed_m_per_s=conditions.speed_m_per_s,
-            change_m_per_s=min(how.change_m_per_s, _STEADY_M_PER_S2 * how.period_s / (2.0 * np.pi)),
-            rate_hz=conditions.rate_hz,
-        ),
-        paths=wheel_paths_of(vehicle, SurfaceOptions(None, None, WANDER_M))
-        if conditions.road == "surface" and vehicle.tandem is None
-        else None,
-    )
-    if number % 3 != 1:
-        return truth, None
-    rng = np.random.default_rng(np.random.SeedSequence([seed, 0x5EA4]))
-    weak = int(rng.integers(bridge.elements))
-    ratios = np.ones(bridge.elements)
-    ratios[weak] = WEAK_RATIO
-    sound = beam_of(bridge, ratios).flexural_rigidity_nm2
-    return truth._replace(beam=truth.beam._replace(flexural_rigidity_nm2=sound)), weak
 
 
 def _came_out(result: CrossingResult, nominal: list[float]) -> dict[str, object]:

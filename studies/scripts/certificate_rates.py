@@ -20,10 +20,9 @@ from rich.console import Console
 from scipy.stats import binom
 
 from schemas.validation_records import ValidationCrossing, load_validation
+from services.simulation.trial_truth import CROSSINGS, WEAK_RATIO
 from services.simulation.validation_trial import (
-    CROSSINGS,
     FEWEST_GOOD,
-    WEAK_RATIO,
     errors_of,
     judge_trial,
 )

@@ -24,7 +24,8 @@ from schemas.site_file import load_site
 from schemas.validation_records import VehicleBridgePair
 from services.simulation.data_alone import crossing_data_only, inputs_of_seen
 from services.simulation.drawn import drive
-from services.simulation.validation_trial import conditions_of, drawn_truth, single_pair_site
+from services.simulation.trial_truth import drawn_truth
+from services.simulation.validation_trial import conditions_of, single_pair_site
 from studies.validation.bound import at_truth
 
 _SITE = Path(__file__).with_name("equal_tyres.toml")

@@ -1,6 +1,7 @@
 """The crossings of a certificate and the rule that judges them."""
 
 from concurrent.futures import BrokenExecutor, Future
+from statistics import NormalDist
 from threading import Timer
 from typing import Any
 
@@ -12,10 +13,10 @@ from schemas.site import Site
 from schemas.validation_records import ValidationCrossing, VehicleBridgePair
 from services.common.errors import FailureError
 from services.simulation import validation_trial as under_test
-from services.simulation.drawn import CrossingTruth, SimulatedCrossing, drive
+from services.simulation.drawn import CrossingTruth, SimulatedCrossing, draw_truth, drive
 from services.simulation.drive import paper_site
+from services.simulation.trial_truth import CROSSINGS
 from services.simulation.validation_trial import (
-    CROSSINGS,
     FEWEST,
     ValidationTrial,
     conditions_of,
@@ -341,6 +342,22 @@ def test_every_third_bridge_is_sound_but_for_one_element(
     assert len(weak) > 1
 
 
+@pytest.mark.parametrize("seed", [1000, 7000])
+def test_total_masses_are_spread_evenly(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All EI of a crossing are proportional to the mass: luck must not decide over a pair."""
+    vehicle = SITE.vehicles[0]
+    scores = []
+    for number in range(CROSSINGS):
+        truth, _, _ = driven(SITE, number, monkeypatch, seed=seed + number)
+        mass_kg = truth.car.body_mass_kg + np.sum(truth.car.unsprung_mass_kg)
+        spread = vehicle.spread("total_mass_kg")
+        scores.append(float(np.log(mass_kg / vehicle.total_mass_kg) / spread))
+    medians = [NormalDist().inv_cdf((n + 0.5) / CROSSINGS) for n in range(CROSSINGS)]
+    assert sorted(scores) == pytest.approx(medians)
+    assert scores != sorted(scores)
+    assert np.std(scores[:8]) == pytest.approx(1.0, abs=0.3)
+
+
 def test_it_is_driven_as_the_site_says(monkeypatch: pytest.MonkeyPatch) -> None:
     site = with_bridge(survey_speed_m_per_s=14.0, road_class="C")
     for seed in range(20):
@@ -354,7 +371,7 @@ def test_it_is_driven_as_the_site_says(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_each_channel_has_its_own_noise() -> None:
     noise = (5.0, 200.0, 50.0, 500.0)
     site = with_bridge(span_m=8.0, end_latitude_deg=SITE.bridges[0].start_latitude_deg)
-    truth = under_test.draw_truth(site, 1)
+    truth = draw_truth(site, 1)
     quick = truth._replace(conditions=truth.conditions._replace(speed_m_per_s=20.0, rate_hz=500.0))
     silent = drive(site, quick, 1, noise_ug_per_rthz=(0.0,) * 4)
     loud = drive(site, quick, 1, noise_ug_per_rthz=noise)
