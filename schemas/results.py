@@ -89,7 +89,7 @@ class Derived(StrictModel):
     probability_torsion: Annotated[Finite, Field(ge=0, le=1)] | None = None
     """Probability that the deck twists under the truck."""
     springs_believed: Annotated[Finite, Field(ge=0, le=1)] | None = None
-    """Weight of the suspension equations: 1 if linear within sensor noise, near 0 with friction."""
+    """Weight of the body equations: 1 if linear within sensor noise, near 0 with friction."""
     ei_level: Parameter | None = None
     """Overall stiffness: length-weighted geometric mean of EI over nominal. Known even where single
     elements are unresolved."""

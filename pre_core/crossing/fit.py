@@ -34,7 +34,7 @@ _FREE_STAGES = ((5.0, 8, 0.2), (1.0, 25, 0.1))
 """Temperatures (factors of the noise), steps at each, and the improvement of the sum of squares
 that ends it."""
 _CLEAR_FRICTION_WEIGHT = 0.05
-"""Weight of the suspension equations below which full weight is not tried: friction is clear."""
+"""Weight of the body equations below which full weight is not tried: friction is clear."""
 NO_FIT_CHI2 = 10.0
 """Value of chi2 at five times the noise above which a strategy with full weight of the suspension
 equations ends and no fit is completed: right starts of 90 simulated crossings had 1.6 at most,
@@ -44,7 +44,7 @@ _POOR_START_CHI2, WORTH_COMPLETING_CHI2 = 1.7, 5.0
 offsets were tried, and is not completed before other strategies either. Accepted fits had 1.7 at
 most, and one of 50 had 3.7; fault-free crossings with mismatch had 2 to 20 without it."""
 FAR_OFF_CHI2 = 200.0
-"""Value of chi2 at five times the noise, with reduced weight of the suspension equations, above
+"""Value of chi2 at five times the noise, with reduced weight of the body equations, above
 which the fit is not continued, and of a first fit, above which no other offset is tried: fault-free
 crossings had 13 at most from an offset, one with a second vehicle up to 1,900."""
 HOPELESS_CHI2 = 25.0
@@ -63,7 +63,7 @@ poorly determined parameters."""
 _SAME_LEVEL = 0.1
 """Relative change of a noise level that counts as converged."""
 _CLEAR_MISFIT = 5.0
-"""Mean square of residuals and priors, with reduced weight of the suspension equations, above which
+"""Mean square of residuals and priors, with reduced weight of the body equations, above which
 a minimum need not be exact."""
 SMALL_IMPROVEMENT, _CLEAR_MISFIT_CHI2 = 0.05, 2.0
 """Relative reduction of chi2 below which no other noise or offset is tried at a clear misfit, and
@@ -82,7 +82,7 @@ class SearchStrategy(NamedTuple):
     modes_at_rest: int
     """Number of the bridge's highest modes without initial vibration."""
     uses_suspension: bool
-    """Whether the suspension equations have full weight; such a search stops at clear friction."""
+    """Whether the body equations have full weight; such a search stops at clear friction."""
     max_candidates: int
     """Maximum number of candidate offsets from which all parameters are fitted."""
     models_mismatch: bool
@@ -104,7 +104,7 @@ class Optimum(NamedTuple):
     starts: int
     """Number of offsets from which all parameters were freed."""
     stopped_by_friction: bool = False
-    """Whether a search with full weight of the suspension equations was abandoned for friction."""
+    """Whether a search with full weight of the body equations was abandoned for friction."""
     stopped_by_mismatch: bool = False
     """Whether a search without mismatch was abandoned because of a clear mismatch."""
     unfinished: SearchStrategy | None = None
@@ -120,7 +120,7 @@ def chi2_per_dof(problem: PosteriorProblem, y: FloatArray) -> float:
     """Return the mean square of whitened residuals at y (size,), per degree of freedom.
 
     Each search coordinate and each removed wave takes one degree of freedom. With reduced weight of
-    the suspension equations only the mismatch residuals count, and a third of these coordinates and
+    the body equations only the mismatch residuals count, and a third of these coordinates and
     waves.
     """
     rows = data_rows(problem, y[None, :])[0, :: chi2_stride(problem)]

@@ -41,7 +41,7 @@ class FittedValues(NamedTuple):
     has_mismatch: bool
     """Whether the fit modelled profile mismatch."""
     uses_suspension: bool
-    """Whether the suspension equations had their full weight."""
+    """Whether the body equations had their full weight."""
     lines_hz: tuple[float, ...] = ()
     """Frequencies of the removed hum."""
 

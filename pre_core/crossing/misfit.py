@@ -14,7 +14,7 @@ from pre_core.search.levenberg_marquardt import minimise
 EXPLAINED_CHI2 = 1.5
 """Value of `OffBridgeFit.chi2` up to which truck and road are explained. Where another vehicle, a
 wrong span or an undeclared support acted on the bridge it was 1.0. With full weight of the
-suspension equations and one profile it was 25 or more where springs or profiles of fault-free
+body equations and one profile it was 25 or more where springs or profiles of fault-free
 crossings needed another model."""
 _STEPS, _IMPROVEMENT = 12, 10.0
 """Limit of steps, and the improvement of the sum of squares that ends the fit, whose chi2 is judged

@@ -57,10 +57,10 @@ _EVEN_NOISE_RATIO = 3.0
 declared density has up to 1.6 before the truck is found; friction, bilinear dampers and mismatch 4
 to 100."""
 _SUSPENSION_BAND_HZ = 30.0
-"""Highest frequency in the weight of the suspension equations."""
+"""Highest frequency in the weight of the body equations."""
 FRICTION_STATISTIC, FRICTION_STATISTIC_OF_MISFIT = 60.0, 15.0
 """Likelihood-ratio statistic (`whittle`) of an axle's residuals that reduces the weight of its
-suspension equations: the second where nothing else explains a misfit. Of 400 axles with sensor
+body equations: the second where nothing else explains a misfit. Of 400 axles with sensor
 noise alone twelve had more than 15, none more than 60."""
 _EQUAL_TYRES = 0.05
 """Sensitivity to unequal tyres below which tyres count as equal; the mismatch is then an axle's
@@ -391,7 +391,7 @@ def noise_power_ratio(
 def suspension_equation_weight(
     rows: RowFilter, truck: NoisePath, density: FloatArray, force: FloatArray
 ) -> float:
-    """Return the suspension equations' weight: sensor noise's mean share (0 to 1) of all noise.
+    """Return the body equations' weight: sensor noise's mean share (0 to 1) of all noise.
 
     `density` (4,) is that of the sensors, `force` (2, shapes) the suspension noise in N²/Hz.
     """

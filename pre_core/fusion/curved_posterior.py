@@ -1,4 +1,4 @@
-"""Posterior of a bridge on the surfaces of its crossings, without a common linearisation.
+"""Posterior of a bridge on the response surfaces of its crossings, without a common linearisation.
 
 Where crossings determine elements poorly, the widths of a normal about the most likely bridge are
 those of that bridge: it has no springs, and its ends are known better than those of the true one.

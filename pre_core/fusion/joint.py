@@ -82,8 +82,8 @@ def sample_joint(
 ) -> FusedDraws:
     """Return draws of a bridge, `count` of each chain; they do not depend on `threads`.
 
-    `parts` are the crossings in `information`. With surfaces the bridge varies by the root mean
-    square of tau.
+    `parts` are the crossings in `information`. With response surfaces the bridge varies by the root
+    mean square of tau.
     """
     between = variability_posterior(information, priors)
     if any(one.likelihood.bends and one.likelihood.bends.logarithms for one in parts):

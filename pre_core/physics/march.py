@@ -52,7 +52,7 @@ class ModalBridge(NamedTuple):
 
 
 class WheelTrack(NamedTuple):
-    """Place and ground of both wheels at every step."""
+    """Position and road height of both wheels at every step."""
 
     element: NDArray[np.int64]  # (steps, 2): -1 off the bridge
     place: FloatArray  # (steps, 2): 0..1 within the element

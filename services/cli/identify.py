@@ -362,7 +362,7 @@ def _support_lines(derived: Derived, *, torsion_declared: bool) -> Iterator[str]
         likely = f"{100.0 * derived.probability_torsion:.0f} %"
         yield f"probability that the deck twists under the truck: {likely} (50 %: not determined)"
     if derived.springs_believed is not None:
-        yield f"weight of the suspension equations: {100.0 * derived.springs_believed:.0f} %"
+        yield f"weight of the body equations: {100.0 * derived.springs_believed:.0f} %"
 
 
 def _level_lines(crossing: CrossingResult, *, is_stated: bool) -> Iterator[str]:

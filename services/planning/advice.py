@@ -116,10 +116,12 @@ def _of_the_others(found: SurveyForecast) -> str:
         if _helps(one, planned)
     ]
     better = sorted([*better, *_other_speeds(found)], key=lambda one: (one.cost, one.rank))
-    tandem = f"{TANDEM}, by less than its row states." if _is_tandem_advised(found) else ""
+    is_tandem_advised = _is_tandem_advised(found)
     if not better:
         other = "No other change of truck, load, direction or sensors helps much."
-        return f"What helps is {tandem}" if tandem else other
+        return (
+            f"What helps is {TANDEM}, but less than its row states." if is_tandem_advised else other
+        )
     first, *rest = better
     is_best = all(first.rank <= one.rank for one in rest)
     how = "at no cost" if first.cost == 0 else "most" if is_best else "at the least cost"
@@ -128,7 +130,9 @@ def _of_the_others(found: SurveyForecast) -> str:
     for second in (more or rest)[:1]:
         how = "What helps more" if more else "Next best"
         sentence += f" {how}: {second.text} (then {second.gain})."
-    return f"{sentence} So does {tandem}" if tandem else sentence
+    if is_tandem_advised:
+        sentence += f" {TANDEM.capitalize()} helps, too, but less than its row states."
+    return sentence
 
 
 def _other_speeds(found: SurveyForecast) -> Iterator[_Change]:

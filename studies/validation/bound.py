@@ -127,7 +127,7 @@ def _on_its_road(
         shapes=mismatch_spectra(front, rear._replace(offset_m=0.0))
     )
     level = expected_levels(front, rear, truth.conditions.road_class)
-    # The suspension equations have full weight until the nuisances are fitted: their residuals are
+    # The body equations have full weight until the nuisances are fitted: their residuals are
     # read off the rows.
     ratio = truth.paths.pavement.deck_roughness
     return update_noise(

@@ -253,5 +253,5 @@ def test_forecast_prints_the_speeds_it_assumes() -> None:
     text = "\n".join(lines_of(made_up(9, {})))
     assert "road of class A, 12 crossings\n" in text
     assert (
-        "\nassumed speeds, whatever the feasible ones: half at 8.5 m/s, half at 11.5 m/s\n" in text
+        "\nassumed speeds, not only the feasible ones: half at 8.5 m/s, half at 11.5 m/s\n" in text
     )

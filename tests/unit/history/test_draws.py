@@ -55,7 +55,7 @@ def test_the_draws_are_those_of_the_result_and_of_what_is_printed(
     assert giving is not None
     start = f"{100.0 * giving.start:.0f} % at the start"
     assert f"probability of bearing compliance: {start}" in printed
-    assert "weight of the suspension equations: 100 %" in printed
+    assert "weight of the body equations: 100 %" in printed
     # The state of the bridge, as the report has it, is not without the variability.
     assert "\nwith between-crossing variability, as in reports: EI_4 0.4" in printed
     assert "pareto_k" in crossing.diagnostics

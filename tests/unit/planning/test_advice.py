@@ -184,7 +184,7 @@ def test_survey_and_report_advise_a_tandem_for_the_same_trucks(
     truck = SITE.vehicles[0].model_copy(update={"twin_tyre_distance_m": (0.0, twin_m)})
     site = SITE.model_copy(update={"vehicles": (truck,), "bridges": (bridge,)})
     found = forecast((None, None, 0.5), site=site, tandem=(6, 43, 0.17))
-    is_advised = f"What helps is {TANDEM}, by less" in advice(found)
+    is_advised = f"What helps is {TANDEM}, but less" in advice(found)
     words = ENGLISH.text(f"advice.open_{truck_to_try(truck, bridge)}")
     assert is_advised == ("equalised tandem" in words)
     assert is_advised == (twin_m > 0.0 and not supports_m)
@@ -193,7 +193,9 @@ def test_survey_and_report_advise_a_tandem_for_the_same_trucks(
 def test_tandem_that_does_not_help_is_not_advised() -> None:
     assert NONE_HELPS in advice(forecast((9, 40, 0.2), tandem=(9, 40, 0.19)))
     better = forecast((None, None, 0.5), few=(20, None, 0.3), tandem=(6, 43, 0.17))
-    assert advice(better).endswith(f"So does {TANDEM}, by less than its row states.")
+    assert advice(better).endswith(
+        f"{TANDEM.capitalize()} helps, too, but less than its row states."
+    )
 
 
 def test_legend_says_why_equal_deviations_are_seen_unequally() -> None:

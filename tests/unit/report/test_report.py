@@ -99,7 +99,7 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     assert "A loss that affects all elements equally cannot be detected without a baseline." in text
     # The evidence.
     assert "reduced chi-square (χ²/dof) 1.02 1.02 residuals relative to the declared noise" in text
-    assert "weight of the suspension equations (%) 100 100 100 %" in text
+    assert "weight of the body equations (%) 100 100 100 %" in text
     assert "rotational restraint (%) 3 and 4 3 and 4 probability" in text
     assert "R-hat 1.004 1.004 agreement" in text
     assert "truck-1 south-west to north-east 10.0 pre good yes" in text
