@@ -203,22 +203,7 @@ def draw_truth(site: Site, seed: int, mass_score: float | None = None) -> Crossi
     conditions = _draw_conditions(vehicle, rng)
     compliances = np.abs(rng.standard_normal(2))
     sizes = {key: np.abs(rng.standard_normal(len(vehicle.nominal(key)))) for key in _DRAWN_LAST}
-
-    def at_end(place: int, size: float) -> float:
-        row = parameters.SCALARS[place]
-        is_absent = rng.uniform() < absence(bridge, row)
-        return 0.0 if is_absent else float(size * bridge.scale_at_zero(row.key))
-
-    beam = beam._replace(
-        support_rotational_stiffness_nm_per_rad=(
-            at_end(parameters.K_ROT, springs[0]),
-            at_end(parameters.K_ROT + 1, springs[1]),
-        ),
-        support_compliance_m_per_n=(
-            at_end(parameters.F, compliances[0]),
-            at_end(parameters.F + 1, compliances[1]),
-        ),
-    )
+    beam = _with_supports(beam, bridge, springs, compliances, rng)
     for key, at_zero in sizes.items():
         scale = vehicle.scale_at_zero(key)
         drawn = tuple(
@@ -229,6 +214,28 @@ def draw_truth(site: Site, seed: int, mass_score: float | None = None) -> Crossi
     mass_kg, wheelbase_m = values.pop("total_mass_kg"), values.pop("wheelbase_m")
     car = half_car(values, mass_kg, wheelbase_m, values.pop("cg_height_m", None))
     return CrossingTruth(car, beam, channels, latency, conditions)
+
+
+def _with_supports(
+    beam: Beam, bridge: Bridge, springs: Floats, compliances: Floats, rng: np.random.Generator
+) -> Beam:
+    """Return a beam with restraints and compliances of both ends, each of which may be absent."""
+
+    def at_end(place: int, size: float) -> float:
+        row = parameters.SCALARS[place]
+        is_absent = rng.uniform() < absence(bridge, row)
+        return 0.0 if is_absent else float(size * bridge.scale_at_zero(row.key))
+
+    return beam._replace(
+        support_rotational_stiffness_nm_per_rad=(
+            at_end(parameters.K_ROT, springs[0]),
+            at_end(parameters.K_ROT + 1, springs[1]),
+        ),
+        support_compliance_m_per_n=(
+            at_end(parameters.F, compliances[0]),
+            at_end(parameters.F + 1, compliances[1]),
+        ),
+    )
 
 
 def _draw_channels(sensor: Sensor, rng: np.random.Generator) -> ChannelErrors:
