@@ -27,8 +27,8 @@ Are the intervals reliable? This page is written by
 
     {command} --page docs/validation.md
 
-(`make validate`: 200 crossings, 64 of each effect); every figure on it comes from that run, of
-edition {edition} of the method. No real bridge is among them: no public record of one is known.
+(`make validate WORLDS={each}`); every figure on it comes from that run, of edition {edition} of the
+method. No real bridge is among them: no public record of one is known.
 
 ## Targets
 
@@ -164,7 +164,12 @@ def validation_page(outcome: ValidationOutcome, image: str = "images/calibration
     in_tables += world_checks(outcome.worlds)
     listed = aims(outcome._replace(judged=[], worlds=()))
     listed += [check for check in in_tables if not check.is_met]
-    text = _HEAD.format(command=_command(outcome), edition=METHOD_EDITION, aims=_aims(listed))
+    text = _HEAD.format(
+        command=_command(outcome),
+        each=_each(outcome),
+        edition=METHOD_EDITION,
+        aims=_aims(listed),
+    )
     if len(outcome.drawn) > 1:
         text += _drawn(outcome, image)
     if outcome.control:
@@ -179,12 +184,16 @@ def validation_page(outcome: ValidationOutcome, image: str = "images/calibration
 
 def _command(outcome: ValidationOutcome) -> str:
     """Return the command, with its numbers of crossings."""
-    effects = dict.fromkeys(record["effect"] for record in outcome.worlds)
-    each = len(outcome.worlds) // max(1, len(effects))
     return (
         f"driveby validate --method pre --crossings {len(outcome.drawn)} "
-        f"--control {len(outcome.control)} --out-of-model {each}"
+        f"--control {len(outcome.control)} --out-of-model {_each(outcome)}"
     )
+
+
+def _each(outcome: ValidationOutcome) -> int:
+    """Return the number of crossings of each effect."""
+    effects = dict.fromkeys(record["effect"] for record in outcome.worlds)
+    return len(outcome.worlds) // max(1, len(effects))
 
 
 def _worlds(records: Sequence[Record]) -> str:

@@ -33,7 +33,7 @@ KeyT = TypeVar("KeyT")
 _COVERAGE = (0.93, 0.99)
 _LARGEST_MEAN_Z = 0.4
 _LARGEST_Z = 5.0
-_FEWEST = 64
+_FEWEST = 48
 """Fewest crossings of an effect whose statistics are aims; with fewer they are only shown."""
 
 
