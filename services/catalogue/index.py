@@ -157,7 +157,9 @@ def update_catalog(
             continue
         try:
             if old is not None and (wrong := _contradiction(folder, entry, old, verify=verify)):
-                problems.append(f"{folder.name}/{path}: {wrong}; its row is computed again")
+                problems.append(
+                    f"{folder.name}/{path}: {wrong}; its row is computed again if it can be read"
+                )
                 old = None
             elif old is not None and old.modified_ns != entry.modified_ns:
                 old = old._replace(modified_ns=entry.modified_ns)

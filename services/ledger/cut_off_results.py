@@ -48,10 +48,13 @@ def _complete(path: Path) -> None:
     complete = path.with_name(f".{path.stem}.recovered.mcap")
     try:
         # Without an event: the file holds what its worker published, and nothing else.
-        recovery = recover_recording(path, complete, adds_event=False)
+        messages = recover_recording(path, complete, adds_event=False).messages
     except InputError as error:
         if "holds nothing" not in str(error):
             raise
+        messages = 0
+    if not messages:
+        complete.unlink(missing_ok=True)
         aside = put_aside(path)
         _log.info("%s: killed before its first message; set aside as %s", path, aside.name)
         return
@@ -59,7 +62,7 @@ def _complete(path: Path) -> None:
     complete.replace(path)
     sync(path.parent)
     # How many messages were lost does not matter: what has no result is identified again.
-    kept = f"{count_of(recovery.messages, 'message')} kept"
+    kept = f"{count_of(messages, 'message')} kept"
     _log.info(
         "%s: its worker was killed; %s; crossings without a result are identified again", path, kept
     )

@@ -90,6 +90,15 @@ def test_one_without_anything_is_set_aside(tmp_path: Path, content: bytes) -> No
     assert (tmp_path / f"{FIRST}.crashed").read_bytes() == content
 
 
+def test_one_without_a_message_is_set_aside(tmp_path: Path) -> None:
+    """Its worker was killed after the site file was written; no reader expects such a recording."""
+    writer = RecordingWriter(tmp_path / FIRST, reason="test")
+    writer.sync()
+    writer.abandon()
+    recover_cut_off_results(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [f"{FIRST}.crashed"]
+
+
 def test_closed_files_and_those_of_a_living_writer_are_left_alone(tmp_path: Path) -> None:
     closed = written(tmp_path / FIRST, estimate(0), end=True)
     writer = RecordingWriter(tmp_path / SECOND, reason="test")

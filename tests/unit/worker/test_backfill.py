@@ -1,6 +1,7 @@
 """Which crossings are taken from recordings, when, and that none is twice."""
 
 import fcntl
+import logging
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -153,11 +154,13 @@ def ids(results: list[CrossingResult]) -> list[str]:
 
 
 def test_what_nobody_sends_any_more_gets_its_result_once(
-    tmp_path: Path, record: Callable[..., Path]
+    tmp_path: Path, record: Callable[..., Path], caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level(logging.INFO)
     record(TWO)
     worker = Worker(tmp_path)
     assert ids(worker.go_on()) == IDS
+    assert caplog.text.count("reading 1 recording for crossings to catch up") == 1
     assert sorted(worker.sent) == sorted(output_of(WHOLE))  # byte for byte, states too
     assert worker.backfill.waiting.total == 0
     assert worker.go_on() == []
