@@ -20,7 +20,6 @@ from schemas.settings import IdentificationSettings
 from schemas.signals import NS_PER_S
 from schemas.site import Site
 from schemas.validation_records import VehicleBridgePair
-from services.common.naming import count_of
 from services.execution.processes import BackgroundResult, BackgroundTask, ProcessExecutor
 from services.finding.stays import Passage, are_one, overlap
 from services.identification.engine import Engine
@@ -143,9 +142,6 @@ class Backfill:
             now = time.time()
             self._recordings.update(now, self._scanning)
             engine.note_recorded(self._recordings.until_ns)
-            if self._recordings.groups and not self._reads and self._scanning is None:
-                files = {file.path for group in self._recordings.groups for file in group.files}
-                _log.info("reading %s for crossings to catch up", count_of(len(files), "recording"))
             self._ledger.forget_before(now - self._source.age_s - MARGIN_S)
         self._collect()
         self._ledger.commit(time.time())

@@ -1,5 +1,6 @@
 """A logger's recordings that have changed, in groups to read; and trucks still being recorded."""
 
+import logging
 import re
 from collections import deque
 from collections.abc import Iterator
@@ -9,8 +10,10 @@ from typing import Final, NamedTuple
 from schemas.signals import NS_PER_S
 from schemas.topics import IDENTIFIER
 from services.common.errors import InputError
+from services.common.naming import count_of
 from services.recordings.recording import is_being_written
 
+_log = logging.getLogger(__name__)
 _RECORDED_S: Final = 60.0
 """Age in s up to which a growing recording is active; the logger syncs twice a second."""
 _FILES_AT_ONCE: Final = 4
@@ -96,6 +99,9 @@ class RecordingList:
         self._read = {path: signature for path, signature in self._read.items() if path in seen}
         for vehicle, files in by_vehicle.items():
             self.groups += self._changed(vehicle, files, reading)
+        if self._is_first and self.groups:
+            paths = {file.path for group in self.groups for file in group.files}
+            _log.info("reading %s for crossings to catch up", count_of(len(paths), "recording"))
         self._is_first = False
 
     def _by_vehicle(self, now: float) -> dict[str, list[_File]]:

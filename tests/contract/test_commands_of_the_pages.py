@@ -146,6 +146,7 @@ NOT_RUN = {
     "scp -rp certs/truck-1 truck-1.example.org:tls": MACHINES,
     "scp -rp certs/viewer laptop.example.org:tls": MACHINES,
     "driveby validate --json validation.json --figures figures/": LONG,
+    "make validate WORLDS=48": LONG,
     "driveby validate --method pre --crossings 200 --control 20 --out-of-model 48 "
     "--page docs/validation.md": LONG,
     "driveby simulate --scenario 6 --road A --seed 3 --noise 10 --road-surface --tyres twin "
