@@ -75,7 +75,7 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
         f"{found.road.road_class}, {question.crossings} crossings"
     )
     halves = ", ".join(f"half at {speed:.1f} m/s" for speed in speeds)
-    yield f"assumed speeds, not only the feasible ones: {halves}"
+    yield f"assumed speeds: {halves}"
     if found.road.is_surface:
         yield mismatch_in_words(found)
     false = percent(FALSE_ALARM)

@@ -252,6 +252,4 @@ def test_forecast_says_what_a_comparison_of_two_surveys_takes() -> None:
 def test_forecast_prints_the_speeds_it_assumes() -> None:
     text = "\n".join(lines_of(made_up(9, {})))
     assert "road of class A, 12 crossings\n" in text
-    assert (
-        "\nassumed speeds, not only the feasible ones: half at 8.5 m/s, half at 11.5 m/s\n" in text
-    )
+    assert "\nassumed speeds: half at 8.5 m/s, half at 11.5 m/s\n" in text
