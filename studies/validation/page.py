@@ -27,8 +27,8 @@ Are the intervals reliable? This page is written by
 
     {command} --page docs/validation.md
 
-(`make validate WORLDS={each}`); every figure on it comes from that run, of edition {edition} of the
-method. No real bridge is among them: no public record of one is known.
+(`make validate WORLDS={each}`); every figure on it comes from that run, of
+edition {edition} of the method. No real bridge is among them: no public record of one is known.
 
 ## Targets
 
