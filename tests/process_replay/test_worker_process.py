@@ -26,7 +26,7 @@ from services.common.errors import InputError
 from services.common.files import lock_folder
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, run_to_messages
-from services.recordings.recording import is_closed, read_info, read_messages, read_site
+from services.recordings.recording import read_info, read_messages, read_site
 from services.recordings.writer import RecordingWriter
 from services.simulation.drive import SimulatedDrive, paper_site
 from services.worker.run import run as run_worker
@@ -416,7 +416,8 @@ def test_one_worker_at_a_time_writes_a_folder(
     second = restartable.begin()
     assert second.stderr is not None
     assert any("no router answers" in line for line in second.stderr)
-    assert is_closed(left)  # by a line in the log of the next run
+    assert not left.exists()  # without a message it is set aside by the next run
+    assert left.with_name(f"{left.name}.crashed").exists()
     kill(second)
 
 
