@@ -13,7 +13,7 @@ from schemas.results import CrossingResult, Results
 from schemas.site import Bridge
 from services.identification.comparison import Estimate, estimate_of_state
 from services.ledger.baselines import read_baseline, state_in
-from services.viewer.baseline import named_baseline
+from services.viewer.baseline import baseline_path
 
 DAY_S = 86_400.0
 PAUSE_DAYS = 14.0
@@ -65,11 +65,9 @@ def before_of(
 ) -> Before | None:
     """Return the baseline: the given one, or that of the site file."""
     if given is None:
-        folder = beside or results.parent
-        if named_baseline(bridge, folder, required=beside is not None)[0] is None:
+        given = baseline_path(bridge, beside or results.parent, required=beside is not None)
+        if given is None:
             return None
-        assert bridge.baseline is not None  # noqa: S101 - it was read
-        given = folder / bridge.baseline
     name, stored = given if isinstance(given, tuple) else (given, read_baseline(given))
     state = state_in(name, stored, bridge)
     used = (one for one in stored.crossings if one.crossing_id in state.crossings_used)

@@ -21,15 +21,18 @@ def named_baseline(
     recording carries its site file to places without the baseline. Raise InputError if the file is
     invalid, or has no state of this bridge with as many elements.
     """
-    if bridge.baseline is None:
+    path = baseline_path(bridge, folder, required=required)
+    if path is None:
         return None, None
+    return estimate_of_state(stored_state(path, bridge)), path.name
+
+
+def baseline_path(bridge: Bridge, folder: Path, *, required: bool = False) -> Path | None:
+    """Return the baseline file that the site file names, None as above."""
+    if bridge.baseline is None:
+        return None
     path = folder / bridge.baseline
     if not required and not path.is_file():
         _log.warning("%s: the baseline %s is missing", bridge.id, path)
-        return None, None
-    return stored_baseline(bridge, path)
-
-
-def stored_baseline(bridge: Bridge, path: Path) -> tuple[Estimate, str]:
-    """Return a bridge's state from a results file, and the file's name; InputError as above."""
-    return estimate_of_state(stored_state(path, bridge)), path.name
+        return None
+    return path
