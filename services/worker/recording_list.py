@@ -69,8 +69,6 @@ class RecordingList:
         self._is_first = True
         self.groups: deque[RecordingGroup] = deque()
         """Groups to read."""
-        self.growing: set[str] = set()
-        """Trucks that are being recorded."""
         self.until_ns: dict[str, int] = {}
         """Wall time in ns up to which a truck is recorded, as far as it was lately."""
         self.final: set[str] = set()
@@ -84,16 +82,16 @@ class RecordingList:
     def update(self, now: float, reading: RecordingGroup | None) -> None:
         """List the recordings at `now`, the time in s since 1970; `reading` is being read."""
         by_vehicle = self._by_vehicle(now)
-        self.growing = {v for v, files in by_vehicle.items() if any(f.is_growing for f in files)}
+        growing = {v for v, files in by_vehicle.items() if any(f.is_growing for f in files)}
         last_ns = {v: max(f.signature[1] for f in files) for v, files in by_vehicle.items()}
         recent_ns = round((now - _RECENT_S) * NS_PER_S)
         self.until_ns = {v: at_ns for v, at_ns in last_ns.items() if at_ns >= recent_ns}
-        self.until_ns |= dict.fromkeys(self.growing, _GROWS_NS)
+        self.until_ns |= dict.fromkeys(growing, _GROWS_NS)
         quiet_ns = round((now - _QUIET_S) * NS_PER_S)
         self.final = {
             vehicle
             for vehicle, at_ns in last_ns.items()
-            if vehicle not in self.growing and at_ns < quiet_ns
+            if vehicle not in growing and at_ns < quiet_ns
         }
         seen = {file.path for files in by_vehicle.values() for file in files}
         self._read = {path: signature for path, signature in self._read.items() if path in seen}

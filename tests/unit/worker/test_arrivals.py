@@ -198,12 +198,18 @@ def test_history_that_a_broken_connection_cuts_off_is_continued(in_transit: int)
     assert [one.sequence for one in due] == sorted(2 * list(range(100)))
 
 
-def test_history_cut_off_for_ever_is_processed_when_the_truck_is_lost() -> None:
+def left_by(only: TruckMessage, at_s: float) -> ArrivalQueue:
+    """Return the queue of a truck that sent one message and left."""
     arrivals = ArrivalQueue()
     arrivals.note(token(0.0, is_alive=True))
-    only = numbered(0.0, 700)
     arrivals.add(only)
-    arrivals.note(token(2.0, is_alive=False))
+    arrivals.note(token(at_s, is_alive=False))
+    return arrivals
+
+
+def test_history_cut_off_for_ever_is_processed_when_the_truck_is_lost() -> None:
+    only = numbered(0.0, 700)
+    arrivals = left_by(only, 2.0)
     assert arrivals.due(5.0) == []
     assert arrivals.gone(5.0) == [gone()]
     assert arrivals.due(121.9) == []
@@ -212,11 +218,8 @@ def test_history_cut_off_for_ever_is_processed_when_the_truck_is_lost() -> None:
 
 
 def test_complete_history_of_a_truck_that_has_left_is_processed_before_its_departure() -> None:
-    arrivals = ArrivalQueue()
-    arrivals.note(token(0.0, is_alive=True))
     only = numbered(0.0, 0)
-    arrivals.add(only)
-    arrivals.note(token(0.1, is_alive=False))
+    arrivals = left_by(only, 0.1)
     assert arrivals.due(3.1) == [only]
     assert arrivals.gone(3.1) == [gone()]
 
