@@ -15,7 +15,8 @@ CROSSINGS: Final = 12
 WEAK_RATIO: Final = 0.5
 _STEADY_M_PER_S2: Final = 0.1
 """Largest change of speed: a survey is driven evenly."""
-_ALL_SEEDS: Final = 1 << 63
+ALL_SEEDS: Final = 1 << 63
+"""Number of seeds of crossings."""
 
 
 def drawn_truth(
@@ -53,6 +54,6 @@ def _mass_score(first_seed: int, number: int) -> float:
     Twelve independent draws are one set of luck, shared by every pair, that decides alone where
     everything else is known well.
     """
-    rng = np.random.default_rng(np.random.SeedSequence([first_seed % _ALL_SEEDS, 0x3A55]))
+    rng = np.random.default_rng(np.random.SeedSequence([first_seed % ALL_SEEDS, 0x3A55]))
     part = int(rng.permutation(CROSSINGS)[number % CROSSINGS])
     return NormalDist().inv_cdf((part + 0.5) / CROSSINGS)

@@ -41,7 +41,7 @@ from services.finding.placed import middle_sensor, middle_site
 from services.recordings.recording import program_version
 from services.simulation.drawn import CrossingTruth, drive, identify_simulated
 from services.simulation.drawn_tandem import drawn_tandem
-from services.simulation.trial_truth import CROSSINGS, drawn_truth
+from services.simulation.trial_truth import ALL_SEEDS, CROSSINGS, drawn_truth
 
 _log = logging.getLogger(__name__)
 
@@ -64,7 +64,6 @@ _ROAD_CLASS: Final = "B"
 """Road class where the site file has none."""
 _SEEDS: Final = 1000
 """Distance of the crossings' seeds between two seeds of trials."""
-_ALL_SEEDS: Final = 1 << 63
 _SHOWN_EVERY_S: Final = 10.0
 
 
@@ -118,7 +117,7 @@ class ValidationTrial:
         return TrialCrossing(number, run)
 
     def _seed_of(self, number: int) -> int:
-        return (self._seed * _SEEDS + number) % _ALL_SEEDS
+        return (self._seed * _SEEDS + number) % ALL_SEEDS
 
     def add(self, number: int, tried: ValidationCrossing) -> None:
         """Add the result of a crossing; ignore those after the judgement."""
