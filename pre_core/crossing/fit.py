@@ -36,7 +36,7 @@ that ends it."""
 _CLEAR_FRICTION_WEIGHT = 0.05
 """Weight of the body equations below which full weight is not tried: friction is clear."""
 NO_FIT_CHI2 = 10.0
-"""Value of chi2 at five times the noise above which a strategy with full weight of the suspension
+"""Value of chi2 at five times the noise above which a strategy with full weight of the body
 equations ends and no fit is completed: right starts of 90 simulated crossings had 1.6 at most,
 wrong ones 10 to 70."""
 _POOR_START_CHI2, WORTH_COMPLETING_CHI2 = 1.7, 5.0
