@@ -174,14 +174,16 @@ def sample_tolerance(expected: dict[str, Any]) -> dict[str, float]:
     """How far the sample may be from its reference, as rounding decides which draws are kept.
 
     The least draws, 400, are those of the deflection: two such means differ by 0.07 standard
-    deviations, two quantiles 2.5 % by 0.19. Three times that is allowed. Of parameters that are
-    mostly zero a few draws decide, and whether a quantile is one of them: 3.
+    deviations, two quantiles 2.5 % by 0.19. Four times that is allowed: of the 128 values three
+    times would be exceeded by one on every third kind of processor, as was measured (a quantile
+    moved by 0.63 with the kernels for AVX-512). Of parameters that are mostly zero a few draws
+    decide, and whether a quantile is one of them: 3.
     """
     tolerance = {}
     for name, values in expected["estimates"].items():
         seldom = name.startswith(SELDOM)
         for what in values:
-            most = 3.0 if seldom else 0.2 if what == "mean" else 0.6
+            most = 3.0 if seldom else 0.28 if what == "mean" else 0.76
             tolerance[f".estimates.{name}.{what}"] = most * values["std"]
     # The road is drawn at the mean of the chains: micrometres follow from a tenth of all spreads.
     tolerance |= {".road_front_m": 5e-6, ".road_rear_m": 5e-6, ".iri_m_per_km": 1e-2}
