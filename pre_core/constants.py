@@ -11,6 +11,9 @@ NORMAL_975 = 1.959963984540054
 """97.5 % quantile of the standard normal distribution: half the width of a 95 % interval in
 standard deviations."""
 
+NORMAL_95 = 1.6448536269514722
+"""95 % quantile of the standard normal distribution."""
+
 SLOPE_SPREAD = 4e-3
 """Prior standard deviation of the part of d ln EI/dT that all elements of a bridge share, 1/K:
 concrete and asphalt lose some tenths of a per cent per kelvin."""

@@ -7,90 +7,27 @@ is used, to make elements of different design comparable.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Collection, Iterable, Iterator, Sequence, Set
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from pre_core.constants import NORMAL_975
+from pre_core.constants import NORMAL_95, NORMAL_975
 from schemas.results import RESOLVED, BridgeResult, ElementState, Parameter
-from schemas.topics import is_simulated
 from services.common.arrays import Floats
 from services.common.language import ENGLISH, Language
-from services.common.naming import entry_in_name
 
 CLEAR_LOSS = 0.1
 """Smallest stiffness loss that the whole 95 % interval of a weak element must exceed."""
+DETECTED = 0.95
+"""Probability with which a loss must be clear to be called detectable, as in survey plans."""
 IMPLAUSIBLE_GAIN = 0.2
 """Gain above which no whole 95 % interval of an element is plausible: from summer to winter,
 30 K, the stiffness of concrete and asphalt rises by some 12 %."""
-Stated = Literal["unresolved", "visible"]
-"""A sentence that may be left out: on unresolved elements, on the smallest visible loss."""
-RealmsOfBridges = Mapping[str, Collection[str]]
-"""Realms of crossings, by bridge."""
+Stated = Literal["unresolved", "detectable"]
+"""A sentence that may be left out: on unresolved elements, on the smallest detectable loss."""
 _FEWEST_ELEMENTS = 3
 """Fewest comparable elements: of two, the undamaged one cannot be identified."""
-
-
-def shared_crossings(used: Set[str], before: Set[str], language: Language = ENGLISH) -> str | None:
-    """Return a caution if crossings of a measurement are in its baseline, too; None without any."""
-    common = used & before
-    if not common:
-        return None
-    if common == used == before:
-        return language.text("caution.same.all")
-    return language.choice("caution.same", len(common))
-
-
-def doubts_of_baseline(
-    used: Set[str], before: Set[str], verdict: str | None, language: Language = ENGLISH
-) -> Iterator[str]:
-    """Yield why a comparison with a baseline misleads: its `verdict`, or crossings that are later.
-
-    `used` and `before` are the crossings of the measurement and of the baseline.
-    """
-    if verdict not in (None, "good"):
-        yield language.text("caution.baseline_suspect")
-    entries = [[e for e in map(entry_in_name, of) if e is not None] for of in (before, used)]
-    if all(entries) and max(entries[0]) > max(entries[1]):
-        then, now = (f"{max(of):%Y-%m-%d}" for of in entries)
-        yield language.text("caution.baseline_later", then=then, now=now)
-
-
-def origin_caution(
-    now: Iterable[str], then: Iterable[str], language: Language = ENGLISH
-) -> str | None:
-    """Return a caution if only one of a measurement and its baseline was simulated; else None.
-
-    `now` and `then` are the realms of their crossings.
-    """
-    kinds = [{is_simulated(realm) for realm in realms} for realms in (now, then)]
-    if not all(kinds) or kinds[0] == kinds[1]:
-        return None
-    which = "baseline" if True in kinds[1] else "crossings"
-    return language.text(f"caution.simulated_{which}")
-
-
-def baseline_cautions(
-    states: Mapping[str, BridgeResult],
-    baselines: Mapping[str, BridgeResult],
-    now: RealmsOfBridges,
-    then: RealmsOfBridges,
-) -> Iterator[str]:
-    """Yield a line for each bridge that is compared with another kind, or with its own crossings.
-
-    `now` and `then` are the realms of the crossings and of those of the baselines.
-    """
-    for name, state in states.items():
-        if name not in baselines:
-            continue
-        used, before = (frozenset(one.crossings_used) for one in (state, baselines[name]))
-        for caution in (
-            origin_caution(now.get(name, ()), then.get(name, ())),
-            shared_crossings(used, before),
-        ):
-            if caution is not None:
-                yield f"{name}: {caution}"
 
 
 class Estimate(NamedTuple):
@@ -143,9 +80,22 @@ class Element(NamedTuple):
         return self.is_comparable and self.low > 1.0 + IMPLAUSIBLE_GAIN
 
     @property
-    def visible_loss(self) -> float:
-        """Smallest loss of this element that would have been clear."""
-        return 1.0 - (1.0 - CLEAR_LOSS) * self.ratio / self.high
+    def detectable_loss(self) -> float:
+        """Smallest loss of this element that is clear with the probability `DETECTED`.
+
+        See `clear_loss_detectable`.
+        """
+        return float(clear_loss_detectable(np.log([self.high / self.ratio]))[0])
+
+
+def clear_loss_detectable(half_width: Floats) -> Floats:
+    """Return the losses (n,) that are clear with the probability `DETECTED`.
+
+    `half_width` (n,) is 1.96 σ, with the standard deviation σ of ln EI relative to the reference.
+    The upper end of the interval of a loss L is distributed about ln(1 - L) + 1.96 σ with the same
+    σ. It lies below that of a clear loss in 95 of 100 measurements if the middle is 1.64 σ below.
+    """
+    return 1.0 - (1.0 - CLEAR_LOSS) * np.exp(-half_width * (1.0 + NORMAL_95 / NORMAL_975))
 
 
 class Comparison(NamedTuple):
@@ -325,8 +275,8 @@ def describe_comparison(
         before, count = found.unresolved_before, len(found.elements)
         wordings.append(_not_resolved("unresolved_before", count, before, language))
     resolved = tuple(e for e in found.rest if e.number not in every)
-    if resolved and "visible" not in without:
-        wordings.append(_smallest_seen("rest.resolved", resolved, language))
+    if resolved and "detectable" not in without:
+        wordings.append(smallest_detectable("rest.resolved", resolved, language))
     if level is not None:
         wordings.append(describe_level(level, language))
     return wordings
@@ -359,6 +309,33 @@ def describe_weak_before(weak: Sequence[Element], language: Language = ENGLISH) 
         yield language.choice("caution.earlier", len(weak), elements=language.listed(listed))
 
 
+def describe_possibly_weak(
+    elements: Sequence[Element], language: Language = ENGLISH
+) -> Iterator[str]:
+    """Yield the elements whose interval excludes no loss, but not a small one; nothing if none."""
+    if elements:
+        yield language.choice(
+            "caution.lower",
+            len(elements),
+            elements=changes_in_words(elements, language),
+            limit=100.0 * CLEAR_LOSS,
+        )
+
+
+def changes_in_words(elements: Sequence[Element], language: Language) -> str:
+    """Return a list of elements with their changes and intervals."""
+    return language.listed(
+        [
+            language.text(
+                "caution.change",
+                number=one.number,
+                **{end: language.change(getattr(one, end)) for end in ("ratio", "low", "high")},
+            )
+            for one in elements
+        ]
+    )
+
+
 def describe_clear_elements(found: Comparison, language: Language = ENGLISH) -> list[str]:
     """Return sentences on elements that differ clearly, and none on the others."""
     clear = tuple(one for one in found.elements if one.is_weak or one.is_stiff)
@@ -386,26 +363,26 @@ def sentences(
         within = max(1, per_cent_up(farthest))
         which = "rest" if wordings else "all"
         wordings.append(language.text(f"{which}.{found.reference}", within=within))
-        if "visible" not in without:
-            wordings.append(_smallest_seen("rest.visible", found.rest, language))
+        if "detectable" not in without:
+            wordings.append(smallest_detectable("rest.detectable", found.rest, language))
     return wordings
 
 
-def _smallest_seen(key: str, elements: Sequence[Element], language: Language) -> str:
-    """Return the sentence on the loss that would have been clear in each of the elements.
+def smallest_detectable(key: str, elements: Sequence[Element], language: Language) -> str:
+    """Return the sentence on the loss that is detectable in each of the elements.
 
     Ends are often known far worse than the rest: where losses differ, both are named.
     """
-    worst = max(elements, key=lambda element: element.visible_loss)
-    best = min(elements, key=lambda element: element.visible_loss)
-    low, high = per_cent_up(best.visible_loss), per_cent_up(worst.visible_loss)
+    worst = max(elements, key=lambda element: element.detectable_loss)
+    best = min(elements, key=lambda element: element.detectable_loss)
+    low, high = per_cent_up(best.detectable_loss), per_cent_up(worst.detectable_loss)
     if low == high:
         return language.text(key, loss=high)
     return language.text("rest.range", low=low, best=best.number, high=high, worst=worst.number)
 
 
 def per_cent_up(share: float) -> int:
-    """Return a share in per cent, rounded up: a loss of that size is certain to be detected."""
+    """Return a share in per cent, rounded up, so that no smaller loss is stated as detectable."""
     return int(np.ceil(100.0 * share - 1e-6))
 
 

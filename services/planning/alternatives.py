@@ -18,6 +18,12 @@ SPREAD: Final = 0.15
 """Relative deviation of a survey's speeds from the planned one, to either side."""
 _LIGHTER, _HEAVIER = 0.4, 1.5
 """Loads of an emptied and of a loaded truck, relative to the planned load on its springs."""
+_LEAST_HEAVIER = 1.1
+"""Least relative load of a loaded truck that is worth a row."""
+_LEGAL_TOTAL_KG: Final = {2: 18_000.0, 3: 26_000.0}
+"""Largest total mass in international traffic by number of axles (Directive 96/53/EC, Annex I)."""
+_LEGAL_AXLE_KG: Final = 11_500.0
+"""Largest load of a driving axle there."""
 _QUIETER: Final = 0.25
 _ELEMENTS: Final = (5, 3)
 _MOVED: Final = 0.12
@@ -75,7 +81,7 @@ def alternatives(site: Site, speed_m_per_s: float) -> Iterator[Plan]:
     planned = _spread(site, speed_m_per_s)
     for name, other_truck in _other_trucks(site):
         yield Plan(name, (_spread(other_truck, speed_m_per_s),))
-    for factor in (_LIGHTER, _HEAVIER):
+    for factor in (_LIGHTER, *_heavier(vehicle)):
         loaded = _with_vehicle(site, _carrying(vehicle, factor))
         other = loaded.vehicles[0].total_mass_kg / 1e3
         yield Plan(
@@ -192,6 +198,19 @@ def _carrying(vehicle: Vehicle, factor: float) -> Vehicle:
         for axle in vehicle.axles
     )
     return vehicle.model_copy(update={"total_mass_kg": round(total, 1), "axles": axles})
+
+
+def _heavier(vehicle: Vehicle) -> Iterator[float]:
+    """Yield the relative load of a loaded truck within legal limits, unless it is hardly more."""
+    legal = _LEGAL_TOTAL_KG[2 if vehicle.tandem is None else 3]
+    factors = [_HEAVIER, (legal - sum(vehicle.unsprung_mass_kg)) / vehicle.sprung_mass_kg]
+    if vehicle.tandem is None:
+        factors += [
+            (_LEGAL_AXLE_KG - unsprung) / (load - unsprung)
+            for load, unsprung in zip(axle_loads_kg(vehicle), vehicle.unsprung_mass_kg, strict=True)
+        ]
+    if min(factors) >= _LEAST_HEAVIER:
+        yield min(factors)
 
 
 def _moved(vehicle: Vehicle) -> Vehicle:

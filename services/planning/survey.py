@@ -6,6 +6,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from pre_core.constants import NORMAL_975
 from pre_core.survey import detection
 from pre_core.survey.plan import (
     BridgePrior,
@@ -19,6 +20,7 @@ from schemas.site import Bridge, Site
 from services.common.arrays import Floats
 from services.common.errors import FailureError
 from services.common.progress import Steps, no_step_progress
+from services.identification.comparison import clear_loss_detectable
 from services.planning.alternatives import Plan, alternatives, as_planned
 from services.planning.crossings import CrossingSimulator, PlannedCrossing, PlannedRoad, scale_error
 
@@ -54,6 +56,8 @@ class SurveyExpectation(NamedTuple):
     """The same against the mean of the other elements."""
     smallest_loss: Floats
     """Minimum loss against the nominal value that is detected with `DETECTION_PROBABILITY`."""
+    smallest_clear_loss: Floats
+    """Minimum loss that a report calls clear against the others, with the same probability."""
 
 
 class PlanForecast(NamedTuple):
@@ -228,6 +232,7 @@ def _expected(
         detection.detection_probability(loss, errors.of_nominal),
         detection.detection_probability(loss, errors.of_others),
         detection.minimum_detectable_loss(errors.of_nominal),
+        clear_loss_detectable(NORMAL_975 * errors.of_others),
     )
 
 

@@ -12,6 +12,7 @@ import pytest
 from schemas.site import Site
 from schemas.site_file import site_toml
 from services.cli import main as cli
+from services.identification.comparison import Element, clear_loss_detectable
 from services.planning import plan_survey
 from services.planning import survey as planning
 from services.planning.advice import advice, warnings
@@ -34,7 +35,7 @@ def test_a_plan_of_the_example(
     assert cli.main([*arguments, "--json", str(found), "--figure", str(picture)]) == 0
     out, errors = capsys.readouterr()
     assert "forecasting 12 crossings of bridge-1 by truck-1 and the alternatives: 10 p" in errors
-    assert "t: only if legal axle and total loads allow it" in out  # no mass is known to be legal
+    assert "at … t: at most 18 t, with three axles 26 t, as in the EU" in out
     plan = json.loads(found.read_text(encoding="utf-8"))
     assert picture.stat().st_size > 10_000
     planned = plan["planned"]["all_crossings"]
@@ -82,7 +83,8 @@ def test_what_is_refused(
 
 def expected(std: float, crossings: int = 12) -> SurveyExpectation:
     wide = np.full(7, std)
-    return SurveyExpectation(crossings, wide, std / 3.0, wide, wide, np.minimum(0.9, 3.0 * wide))
+    loss = np.minimum(0.9, 3.0 * wide)
+    return SurveyExpectation(crossings, wide, std / 3.0, wide, wide, loss, loss)
 
 
 def made_up(needed: int | None, others: dict[str, float], speed: float = 10.0) -> SurveyForecast:
@@ -226,10 +228,16 @@ def test_half_of_the_runs_takes_at_least_two_crossings() -> None:
     assert {plan.fewest_crossings for plan in plans if plan not in halves} == {1}
 
 
-def test_detection_is_not_the_rule_of_a_clear_finding() -> None:
-    text = " ".join(lines_of(made_up(9, {})))
-    assert "detected: by a one-sided test with 1 % false alarms; a report calls" in text
-    assert "its whole 95 % interval is more than 10 % below the others or the baseline" in text
+def test_the_loss_that_a_report_calls_clear_is_forecast() -> None:
+    """It is the report's own figure for a survey that is as accurate as forecast."""
+    lines = list(lines_of(made_up(9, {})))
+    assert lines[6].endswith("smallest  clear")
+    assert "the whole 95 % interval is more than 10 % below the other elements" in " ".join(lines)
+    (clear,) = clear_loss_detectable(np.array([1.96 * 0.05]))
+    ratio, high = 1.0 - clear, (1.0 - clear) * np.exp(1.96 * 0.05)
+    loss = Element(1, 0.0, 5.0, ratio, 0.5, high).detectable_loss
+    assert clear == pytest.approx(loss, rel=1e-9)
+    assert clear == pytest.approx(1.0 - 0.9 * np.exp(-(1.96 + 1.645) * 0.05), abs=1e-4)
 
 
 def test_picture_names_bridge_truck_and_threshold() -> None:

@@ -43,7 +43,8 @@ def forecast(
     def row(name: str, values: Row) -> PlanForecast:
         middle, ends, smallest = values
         wide = np.full(7, 0.2)
-        expected = SurveyExpectation(crossings, wide, 0.1, wide, wide, np.full(7, smallest))
+        limit = np.full(7, smallest)
+        expected = SurveyExpectation(crossings, wide, 0.1, wide, wide, limit, limit)
         of = of_tandem if name == TANDEM else plan
         return PlanForecast(of._replace(name=name), expected, expected, 3, middle, ends)
 

@@ -59,6 +59,27 @@ def test_other_loads_change_nothing_but_the_mass() -> None:
     assert masses == pytest.approx([1220.0 + 0.4 * 8310.0, 1220.0 + 1.5 * 8310.0])
 
 
+@pytest.mark.parametrize(
+    ("total_kg", "share", "heaviest_kg"),
+    [(13_000.0, 0.5, 18_000.0), (13_000.0, 0.7, 16_575.7), (17_000.0, 0.5, None)],
+)
+def test_no_load_beyond_what_is_legal_is_proposed(
+    total_kg: float, share: float, heaviest_kg: float | None
+) -> None:
+    """Two axles carry 18 t, and one of them 11.5 t at most."""
+    site = paper_site()
+    truck = site.vehicles[0]
+    changed = {"total_mass_kg": total_kg, "front_axle_to_cg_m": share * truck.wheelbase_m}
+    site = site.model_copy(update={"vehicles": (truck.model_copy(update=changed),)})
+    masses = [
+        plan.tracks[0][2].site.vehicles[0].total_mass_kg
+        for name, plan in named(site).items()
+        if name.startswith("half of the runs at")
+    ]
+    heavier = [mass for mass in masses if mass > total_kg]
+    assert heavier == ([] if heaviest_kg is None else [pytest.approx(heaviest_kg, abs=1.0)])
+
+
 def test_the_way_back_is_in_another_track() -> None:
     there, back = named(paper_site())["half of the runs the other way"].tracks
     assert [one.forward for one in (*there, *back)] == [True, True, False, False]
