@@ -4,11 +4,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from datetime import date
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
+
 from schemas.reasons import LEFT_OUT_TEXTS, BridgeReason
 from schemas.results import BridgeResult, ElementState, Parameter, Thirds, ThirdsState, Track
 from services.common.language import ENGLISH
 from services.common.naming import count_of, entry_in_name
-from services.identification.comparison import describe_level
+from services.identification.bridge_state import compared
+from services.identification.comparison import (
+    describe_level,
+    describe_possibly_weak,
+    unresolved_elements,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,6 +26,11 @@ _ENOUGH_RUNS = 5
 _NO_CHANGE = (
     "all crossings are combined here; whether EI changed between them: driveby history, driveby "
     "alarm check"
+)
+
+_NO_BASELINE = (
+    "no baseline: elements are compared with each other only; a loss since an earlier survey is "
+    "found by --baseline EARLIER.json"
 )
 
 
@@ -59,7 +71,7 @@ def print_bridge(console: "Console", bridge: BridgeElements, state: BridgeResult
     has_meaning = BridgeReason.NOT_FUSED not in state.reasons
     print_elements(console, bridge, state.elements, has_meaning, state.probability_of_loss)
     if state.finding is not None:
-        print_finding(console, state)
+        print_finding(console, bridge, state)
         if state.probability_of_loss is None and len(_days(state)) > 1:
             console.print(_NO_CHANGE, highlight=False)
     for line in _of_state(state):
@@ -79,9 +91,18 @@ def print_reasons(
             console.print(line, highlight=False, markup=False)
 
 
-def print_finding(console: "Console", state: BridgeResult) -> None:
-    """Print the finding of a state."""
+def print_finding(console: "Console", bridge: BridgeElements, state: BridgeResult) -> None:
+    """Print the finding of a state; without a baseline also what it cannot find."""
     console.print(f"[bold]the bridge:[/] {state.finding}", highlight=False)
+    if state.probability_of_loss is not None:
+        return
+    nominal, lengths = map(np.array, (bridge.nominal_flexural_rigidity_nm2, bridge.lengths_m))
+    found = compared(state, nominal, lengths)
+    unresolved = unresolved_elements(state.elements.values())
+    lower = () if found is None else found.lower
+    possibly = [one for one in lower if one.number not in unresolved]
+    for line in (*describe_possibly_weak(possibly), _NO_BASELINE):
+        console.print(line, highlight=False)
 
 
 def _days(state: BridgeResult) -> set[date]:

@@ -53,8 +53,8 @@ from services.history.validation_files import (
     check_validations,
     passed_validations,
 )
+from services.identification.baseline_cautions import RealmsOfBridges, baseline_cautions
 from services.identification.bridge_state import FusionSettings
-from services.identification.comparison import RealmsOfBridges, baseline_cautions
 from services.identification.methods import lacks_noise
 from services.ledger.baselines import Baselines, baselines_of, realms_of_bridges
 from services.recordings.recording import read_messages
@@ -281,7 +281,7 @@ def _print(console: "Console", found: Results, site: Site) -> None:
             print_bridge(console, site.bridge(name), state)
         elif state.between_crossing_std is not None:
             console.print(_as_state(site.bridge(name), state), highlight=False)
-            print_finding(console, state)
+            print_finding(console, site.bridge(name), state)
 
 
 def print_validation(console: "Console", found: Results, site: Site, folder: Path) -> None:

@@ -25,13 +25,13 @@ from schemas.results import (
 )
 from services.common.arrays import Floats
 from services.common.language import ENGLISH
+from services.identification.baseline_cautions import doubts_of_baseline
 from services.identification.comparison import (
     Comparison,
     compare,
     describe_clear_elements,
     describe_comparison,
     describe_weak_before,
-    doubts_of_baseline,
     estimate_of_state,
     unresolved_elements,
     weak_before,

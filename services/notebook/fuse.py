@@ -18,7 +18,7 @@ from services.common.files import check_writable, write_atomically
 from services.common.kinds import RESULTS
 from services.execution.blas import one_blas_thread
 from services.execution.fuse_results import FusedElements, crossings_to_fuse, fuse_crossings
-from services.identification.comparison import baseline_cautions
+from services.identification.baseline_cautions import baseline_cautions
 from services.ledger.baselines import realms_of_bridges
 from services.notebook.arguments import file_of, known_arguments, path_of
 from services.notebook.read import Name, given_site

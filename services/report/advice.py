@@ -48,6 +48,8 @@ def next_steps(report: BridgeReport, language: Language) -> Iterator[str]:
             yield language.text("advice.check")
             yield language.text("advice.twice")
             return
+    if not report.is_validated:
+        yield language.text("advice.validate")
     comparison = report.view.comparison
     if report.before is not None:
         yield language.text("advice.next_survey")

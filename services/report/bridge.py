@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ from services.identification.comparison import (
     Estimate,
     Stated,
     compare,
-    per_cent_up,
+    smallest_detectable,
     weak_before,
 )
 from services.report.cautions import CautionBasis, cautions
@@ -44,8 +44,8 @@ from services.viewer.crossing_view import CrossingView
 
 _LATEST_S = 7_258_118_400.0
 """The year 2200, as a Unix time in s."""
-LARGEST_MISSED_LOSS = 0.2
-"""Visible loss of an element above which no finding is `sound`: the one that surveys plan for."""
+LARGEST_MISSED_LOSS = 0.25
+"""Detectable loss of an element above which no finding is `sound`."""
 
 
 class BridgeFinding(NamedTuple):
@@ -76,6 +76,8 @@ class BridgeReport(NamedTuple):
     quality: str
     cautions: tuple[str, ...] = ()
     """Sentences on what limits the finding, or belongs next to it."""
+    is_validated: bool = True
+    """Whether site validation of each of its trucks has passed on this bridge."""
     past: BridgeHistory | None = None
     """History of the bridge, if one was given."""
 
@@ -167,6 +169,7 @@ def _report(
         _finding(view, crossings, stored, language),
         " ".join((quality(view, crossings, language), *repeated(repeats, language), *passed)),
         tuple(cautions(basis, language)),
+        not notes,
     )
 
 
@@ -306,9 +309,9 @@ def _finding(
     known = still_weak(view, baseline)
     if known:
         headline = language.choice("finding.known", len(known), elements=language.listed(known))
-        seen = () if missed is None else tuple(_seen(view.comparison, language))
+        seen = () if missed is None else tuple(_seen(view.comparison, view.vague, language))
         kind = "known" if missed is None and not but else "open"
-        without: tuple[Stated, ...] = ("visible",) if seen else ()
+        without: tuple[Stated, ...] = ("detectable",) if seen else ()
         described = describe_bridge(view, language, without)
         return BridgeFinding(kind, headline + but, (*described, *single, *seen))
     if missed is None:
@@ -316,9 +319,9 @@ def _finding(
         return BridgeFinding(kind, language.text("finding.none") + but, wording)
     # The headline names the unresolved elements unless they are most of them.
     are_named = 2 * len(view.vague) <= len(view.comparison.elements)
-    without = ("visible", "unresolved") if are_named else ("visible",)
+    without = ("detectable", "unresolved") if are_named else ("detectable",)
     described = describe_bridge(view, language, without)
-    sentences = (*described, *single, *_seen(view.comparison, language))
+    sentences = (*described, *single, *_seen(view.comparison, view.vague, language))
     return BridgeFinding("open", missed + but, sentences)
 
 
@@ -351,23 +354,17 @@ def _why_open(view: BridgeView, found: Comparison, language: Language) -> str | 
         limit = 100.0 * RESOLVED
         key = f"finding.partly{before}"
         return language.choice(key, len(vague), elements=numbers, limit=limit)
-    if max(one.visible_loss for one in found.elements) > LARGEST_MISSED_LOSS:
+    if max(one.detectable_loss for one in found.elements) > LARGEST_MISSED_LOSS:
         return language.text("finding.coarse", limit=100.0 * LARGEST_MISSED_LOSS)
     return None
 
 
-def _seen(found: Comparison, language: Language) -> Iterator[str]:
-    """Yield from which loss on elements would have been called weak: the best and the worst."""
-    elements = sorted((e for e in found.elements if e.is_comparable), key=lambda e: e.visible_loss)
+def _seen(found: Comparison, vague: Set[int], language: Language) -> Iterator[str]:
+    """Yield from which loss on resolved elements are reliably called weak; nothing without any."""
+    elements = [one for one in found.elements if one.is_comparable and one.number not in vague]
     if elements:
-        best, worst = elements[0], elements[-1]
-        yield language.text(
-            "finding.seen",
-            low=per_cent_up(best.visible_loss),
-            best=best.number,
-            high=per_cent_up(worst.visible_loss),
-            worst=worst.number,
-        )
+        key = "rest.detectable" if len(elements) == len(found.elements) else "rest.resolved"
+        yield smallest_detectable(key, elements, language)
 
 
 def _reasons_of_state(

@@ -11,16 +11,20 @@ from pre_core.constants import SLOPE_SPREAD
 from schemas.results import CrossingResult
 from schemas.site import Bridge
 from services.common.language import Language, utc_day
+from services.identification.baseline_cautions import (
+    doubts_of_baseline,
+    origin_caution,
+    shared_crossings,
+)
 from services.identification.comparison import (
     CLEAR_LOSS,
     IMPLAUSIBLE_GAIN,
     Comparison,
     Element,
+    changes_in_words,
     compare,
+    describe_possibly_weak,
     describe_weak_before,
-    doubts_of_baseline,
-    origin_caution,
-    shared_crossings,
 )
 from services.identification.comparison import weak_before as of_baseline
 from services.report.earlier import Before, CombinedSurveys, days_between, season_of
@@ -61,7 +65,7 @@ def cautions(measured: CautionBasis, language: Language) -> Iterator[str]:
     if comparison is not None:
         yield from _implausible(comparison, language)
         yield from _implausible_before(measured, language)
-        yield from _lower(measured.view, comparison, language)
+        yield from describe_possibly_weak(possibly_weak(measured.view), language)
         yield from _higher(comparison, language)
         if comparison.weak or 2 * len(measured.view.vague) <= len(comparison.elements):
             limit = 100.0 * CLEAR_LOSS
@@ -142,37 +146,12 @@ def _implausible_before(measured: CautionBasis, language: Language) -> Iterator[
         )
 
 
-def _lower(view: BridgeView, comparison: Comparison, language: Language) -> Iterator[str]:
-    elements = possibly_weak(view)
-    if elements:
-        yield language.choice(
-            "caution.lower",
-            len(elements),
-            elements=_changes(elements, language),
-            limit=100.0 * CLEAR_LOSS,
-        )
-
-
 def _higher(comparison: Comparison, language: Language) -> Iterator[str]:
     """Yield the usual causes where elements are stiffer than the baseline."""
     elements = comparison.risen
     if elements:
-        listed = _changes(elements, language)
+        listed = changes_in_words(elements, language)
         yield language.choice("caution.higher", len(elements), elements=listed)
-
-
-def _changes(elements: Sequence[Element], language: Language) -> str:
-    """Return a list of elements with their changes and intervals."""
-    return language.listed(
-        [
-            language.text(
-                "caution.change",
-                number=one.number,
-                **{end: language.change(getattr(one, end)) for end in ("ratio", "low", "high")},
-            )
-            for one in elements
-        ]
-    )
 
 
 def _earlier(measured: CautionBasis, language: Language) -> Iterator[str]:

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 from schemas.site import Site
 from schemas.site_file import parse_site, read_site_text, site_hash
 from services.common.errors import InputError
-from services.identification.comparison import origin_caution
+from services.identification.baseline_cautions import origin_caution
 from services.ledger.baselines import Baselines, baselines_of
 
 _log = logging.getLogger(__name__)
