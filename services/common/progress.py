@@ -19,6 +19,10 @@ _LINE_S: Final = 30.0
 """Shortest time between two lines in s; shorter work prints none."""
 _SILENCE_S: Final = 300.0
 """Longest time between two lines in s."""
+_MINUTES_FROM_S: Final = 90.0
+"""Duration from which minutes are stated."""
+_HOURS_FROM_S: Final = 5400.0
+"""Duration from which hours are stated."""
 
 Offset = Callable[[int], object]
 """Callback with the number of bytes read from a file."""
@@ -75,16 +79,32 @@ class _SparseLines:
 
     def __init__(self) -> None:
         self._began = self._last = time.monotonic()
+        self._first: float | None = None
 
     def add(self, description: str, completed: float, total: float | None) -> None:
         """Log the completed part of the work unless the last line is recent."""
+        if self._first is None:  # what earlier runs have completed took no time of this one
+            self._first = completed
         now = time.monotonic()
         passed_s = now - self._began
         if now - self._last < min(_SILENCE_S, max(_LINE_S, 0.1 * passed_s)):
             return
         self._last = now
         share = f", {100.0 * completed / total:.0f} %" if total else ""
-        progress_log.info("%s%s after %.0f s", description, share, passed_s)
+        left = ""
+        if total and completed > self._first:
+            rest = (total - completed) / (completed - self._first)
+            left = f", about {_duration(rest * passed_s)} left"
+        progress_log.info("%s%s after %.0f s%s", description, share, passed_s, left)
+
+
+def _duration(seconds: float) -> str:
+    """Return a duration with two digits or fewer."""
+    if seconds < _MINUTES_FROM_S:
+        return f"{seconds:.0f} s"
+    if seconds < _HOURS_FROM_S:
+        return f"{seconds / 60.0:.0f} min"
+    return f"{seconds / 3600.0:.1f} h"
 
 
 def start_line(console: "Console", line: str) -> None:

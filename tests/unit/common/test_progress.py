@@ -99,8 +99,26 @@ def test_steps_without_a_terminal_are_a_start_and_sparse_lines(
             progress(done, 205)
     begin, *lines = caplog.messages
     assert begin == "validating 200 crossings"
-    assert lines[:2] == ["crossings, 3 % after 40 s", "crossings, 4 % after 80 s"]
+    assert lines[:2] == [
+        "crossings, 3 % after 40 s, about 66 min left",
+        "crossings, 4 % after 80 s, about 65 min left",
+    ]
     assert 20 < len(lines) < 40  # of 4000 s
+
+
+@pytest.mark.parametrize(
+    ("steps", "left"), [(4, "about 80 s left"), (8, "about 4 min left"), (300, "about 3.3 h left")]
+)
+def test_lines_state_the_remaining_time(
+    clock: list[float], caplog: pytest.LogCaptureFixture, steps: int, left: str
+) -> None:
+    caplog.set_level(logging.INFO, progress_log.name)
+    with steps_bar("crossings", Console(file=io.StringIO())) as progress:
+        progress(0, steps)
+        clock[0] += 80.0
+        progress(2, steps)
+    (line,) = caplog.messages
+    assert line.endswith(f"after 80 s, {left}")
 
 
 def test_steps_on_a_terminal_write_no_lines(
