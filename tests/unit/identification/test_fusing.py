@@ -195,7 +195,7 @@ def test_newest_crossings_that_disagree_give_no_all_clear() -> None:
     assert "newest crossings disagree with the earlier ones" in found.reason_texts[0]
     assert "the bridge may have changed" in found.reason_texts[0]
     assert found.finding is not None
-    assert "would show" not in found.finding
+    assert "is detected with" not in found.finding
     assert "No element differs" not in found.finding
 
 
