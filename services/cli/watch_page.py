@@ -44,6 +44,8 @@ NO_WORKER: Final = "no worker answers"
 _MAX_ALARMS: Final = 4
 """Maximum number of alarm lines at the head of a page, fewer on a low one."""
 _MAX_BRIDGES: Final = 4
+_LINES_OF_BRIDGE: Final = 4
+"""Usual lines of a bridge: its finding is two or three sentences."""
 NO_ALARM: Final = (
     "No alarm was received; it is not known here whether driveby alarm serve watches any bridge."
 )
@@ -81,9 +83,14 @@ def page(
     is_wide = width >= _WIDE
     trucks, rows = _sorted_trucks(model, now_s), model.rows()
     alarms = _alarms(model.alarms.values(), max(1, min(_MAX_ALARMS, height // 10)))
-    taken = 11 + len(model.services) + 3 * min(len(model.bridges), _MAX_BRIDGES) + len(alarms)
+    taken = (
+        11
+        + len(model.services)
+        + _LINES_OF_BRIDGE * min(len(model.bridges), _MAX_BRIDGES)
+        + len(alarms)
+    )
     taken += (bool(model.bridges) and not alarms) + (listening.lost_s is not None)
-    room = max(8 - len(alarms), height - taken)
+    room = max(7 - len(alarms), height - taken)
     most_trucks = max(2, min(len(trucks), room // 3))
     silent = silent_services(model, listening, now_s, now_ns)
     is_worked = listening.lost_s is not None or has_worker(model, silent, now_s)
