@@ -64,6 +64,8 @@ class CatalogUpdate(NamedTuple):
     """Number of recordings that are being written: they have no row yet."""
     problems: tuple[str, ...]
     """Lost, changed or unreadable recordings and invalid files of rows, one line each."""
+    without_row: int
+    """Number of closed recordings that could not be read, each of which is among the problems."""
 
 
 def read_catalog(folder: Folder) -> CatalogContents:
@@ -182,7 +184,8 @@ def update_catalog(
             "(%s)",
             *(folder.name, error),
         )
-    return CatalogUpdate(rows, added, still_open, tuple(problems))
+    without_row = len(recordings) - len(rows) - still_open
+    return CatalogUpdate(rows, added, still_open, tuple(problems), without_row)
 
 
 def _contradiction(folder: Folder, entry: Entry, row: CatalogRow, *, verify: bool) -> str | None:

@@ -53,7 +53,7 @@ def _catalog(options: CatalogOptions) -> int:
     for problem in mended.problems:
         print(problem)
     rows = sorted(mended.rows.values(), key=lambda row: (row.first_ns, row.path))
-    print(_summary(rows, mended.added))
+    print(_summary(rows, mended.added, mended.without_row))
     if mended.still_open:
         print(f"{count_of(mended.still_open, 'more recording')} being written")
     table = list(_table_of_rows(rows))
@@ -69,12 +69,13 @@ def _catalog(options: CatalogOptions) -> int:
     return EXIT_SOMETHING_LOST if mended.problems else 0
 
 
-def _summary(rows: "list[CatalogRow]", added: int) -> str:
+def _summary(rows: "list[CatalogRow]", added: int, not_counted: int) -> str:
     vehicles = {vehicle for row in rows for vehicle in row.vehicles}
     size = sum(row.size_bytes for row in rows)
     gaps = sum(row.gaps for row in rows)
+    left = f", {count_of(not_counted, 'more file')} not counted: see above" if not_counted else ""
     summary = (
-        f"{count_of(len(rows), 'recording')} ({added} new to the catalogue), "
+        f"{count_of(len(rows), 'recording')} ({added} new to the catalogue{left}), "
         f"{count_of(len(vehicles), 'truck')}, {size / 1e6:.1f} MB, {count_of(gaps, 'gap')}"
     )
     measured = [row for row in rows if row.vehicles]  # recordings of results have none

@@ -171,7 +171,7 @@ def test_truck_away_at_both_ends_may_have_crossed(tmp_path: Path, site: Site) ->
 def test_mending_names_what_is_gone_and_changed(fleet: Path, site: Site) -> None:
     folder = folder_at(str(fleet))
     assert update_catalog(folder).added == 3
-    assert update_catalog(folder)[1:] == (0, 0, ())
+    assert update_catalog(folder)[1:] == (0, 0, (), 0)
     a, b, c = (fleet / f"live/2023-11-14/{name}.mcap" for name in "abc")
     a.unlink()
     record(b.with_name("new.mcap"), drive(site, range(20), (10,)))
@@ -199,7 +199,7 @@ def test_a_file_that_was_touched_keeps_its_row(fleet: Path) -> None:
     path = fleet / "live/2023-11-14/a.mcap"
     os.utime(path, ns=(0, path.stat().st_mtime_ns + S))
     mended = update_catalog(folder)
-    assert mended[1:] == (0, 0, ())
+    assert mended[1:] == (0, 0, (), 0)
     assert {r.content for r in mended.rows.values()} == {r.content for r in before.values()}
 
 
@@ -259,7 +259,7 @@ def test_kill_during_packing_leaves_rows_that_count_once(
             update_catalog(folder)
     assert len(list((fleet / CATALOG).rglob("*.parquet"))) == 4
     assert read_catalog(folder).rows == truth
-    assert update_catalog(folder) == (truth, 0, 0, ())
+    assert update_catalog(folder) == (truth, 0, 0, (), 0)
     assert len(list((fleet / CATALOG).rglob("*.parquet"))) == 1
 
 
@@ -347,7 +347,7 @@ def test_a_recording_that_is_not_closed_is_named(fleet: Path) -> None:
     mended = update_catalog(folder_at(str(fleet)))
     (problem,) = mended.problems
     assert problem.startswith(f"{path}: has no index: it was cut off")
-    assert len(mended.rows) == 2
+    assert (len(mended.rows), mended.without_row) == (2, 1)
 
 
 def test_a_recording_that_is_being_written_is_no_problem(
@@ -361,10 +361,10 @@ def test_a_recording_that_is_being_written_is_no_problem(
         assert cli.main(["catalog", str(fleet)]) == 0
         assert "1 more recording being written" in capsys.readouterr().out
     path.write_bytes(whole)
-    assert update_catalog(folder_at(str(fleet)))[1:] == (1, 0, ())
+    assert update_catalog(folder_at(str(fleet)))[1:] == (1, 0, (), 0)
 
 
-def test_a_damaged_recording_is_no_success(fleet: Path) -> None:
+def test_a_damaged_recording_is_no_success(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["catalog", str(fleet)]) == 0
     path = fleet / "live/2023-11-14/a.mcap"
     data = bytearray(path.read_bytes())
@@ -373,7 +373,11 @@ def test_a_damaged_recording_is_no_success(fleet: Path) -> None:
     path.write_bytes(bytes(data))
     os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
     assert cli.main(["catalog", str(fleet)]) == 0
+    capsys.readouterr()
     assert cli.main(["catalog", str(fleet), "--verify"]) == 3
+    out = capsys.readouterr().out
+    assert "\n2 recordings (0 new to the catalogue, 1 more file not counted: see above), " in out
+    assert f"{path}: damaged chunk" in out
 
 
 def upload(fleet: Path, url: str) -> None:
@@ -390,7 +394,7 @@ def check_away(fleet: Path, url: str, site: Site) -> None:
     first, again = update_catalog(away), update_catalog(away)
     assert {path: row.content for path, row in first.rows.items()} == truth
     assert (first.added, first.problems) == (3, ())
-    assert again == (first.rows, 0, 0, ())
+    assert again == (first.rows, 0, 0, (), 0)
     found = crossings_of(away, again.rows.values(), site)
     assert found == crossings_of(here, update_catalog(here).rows.values(), site)
     assert len(found.crossings) == 3
