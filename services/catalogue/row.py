@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from itertools import pairwise
 from typing import BinaryIO, Final, NamedTuple
 
+from mcap.writer import MCAP0_MAGIC
+
 from schemas.signals import NS_PER_S, decode_accel, decode_gnss
 from schemas.topics import Key, topic
 from services.common.errors import InputError
@@ -69,10 +71,7 @@ def row_of(folder: Folder, entry: Entry) -> CatalogRow:
         if index is None:
             if folder.is_local and is_held(file):
                 raise StillOpenError(f"{where}: is being written")
-            raise InputError(
-                f"{where}: has no index: it was cut off, or is being written on another machine "
-                "(driveby recover repairs it)"
-            )
+            raise InputError(f"{where}: {_why_without_index(file, entry.size_bytes)}")
         builder = _RowBuilder()
         try:
             for key, boot_id, message in _messages(where, file, index):
@@ -83,6 +82,22 @@ def row_of(folder: Folder, entry: Entry) -> CatalogRow:
             raise InputError(f"{where}: holds no driveby message; a recording is expected")
         content = file_sha256(file)
     return builder.row(entry, content)
+
+
+def _why_without_index(file: BinaryIO, size: int) -> str:
+    """Return why a file has no readable index, and the remedy."""
+    if not size:
+        return "is empty; an MCAP recording is expected"
+    file.seek(0)
+    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        return "is not an MCAP file; a recording (.mcap) is expected"
+    end = file.seek(max(len(MCAP0_MAGIC), size - len(MCAP0_MAGIC)))
+    if file.read(size - end) == MCAP0_MAGIC:
+        return "its index is damaged (driveby recover repairs it)"
+    return (
+        "has no end: it was being written when it was copied, or its writer was killed "
+        "(driveby recover FILE --set-aside makes it complete), unless another machine is writing it"
+    )
 
 
 def file_sha256(file: BinaryIO) -> bytes:

@@ -5,7 +5,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -346,8 +346,45 @@ def test_a_recording_that_is_not_closed_is_named(fleet: Path) -> None:
     path.write_bytes(path.read_bytes()[:-200])
     mended = update_catalog(folder_at(str(fleet)))
     (problem,) = mended.problems
-    assert problem.startswith(f"{path}: has no index: it was cut off")
+    assert problem == (
+        f"{path}: has no end: it was being written when it was copied, or its writer was killed "
+        "(driveby recover FILE --set-aside makes it complete), unless another machine is writing it"
+    )
     assert (len(mended.rows), mended.without_row) == (2, 1)
+
+
+def test_a_copy_of_an_open_recording_is_incomplete_until_it_is_recovered(
+    fleet: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = fleet / "live/2023-11-14/a.mcap"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    assert cli.main(["catalog", str(fleet), "--verify"]) == 3
+    out = capsys.readouterr().out
+    assert f"{path}: has no end" in out
+    assert "damaged" not in out
+    assert "\n2 recordings (2 new to the catalogue, 1 more file not counted: see above), " in out
+    assert cli.main(["recover", str(path), "--set-aside"]) == 3
+    capsys.readouterr()
+    assert cli.main(["catalog", str(fleet), "--verify"]) == 0
+    assert capsys.readouterr().out.startswith("3 recordings (1 new to the catalogue), ")
+
+
+@pytest.mark.parametrize(
+    ("damage", "why"),
+    [
+        (lambda whole: b"", "is empty; an MCAP recording is expected"),
+        (lambda whole: whole[:8], "has no end: "),
+        (lambda whole: b"a table" * 99, "is not an MCAP file; a recording (.mcap) is expected"),
+        # The offset of the summary in the footer, before its checksum and the magic bytes.
+        (lambda whole: whole[:-28] + bytes(8) + whole[-20:], "its index is damaged (driveby "),
+    ],
+)
+def test_why_a_file_has_no_index(fleet: Path, damage: Callable[[bytes], bytes], why: str) -> None:
+    path = fleet / "live/2023-11-14/a.mcap"
+    path.write_bytes(damage(path.read_bytes()))
+    (problem,) = update_catalog(folder_at(str(fleet))).problems
+    assert problem.startswith(f"{path}: {why}")
 
 
 def test_a_recording_that_is_being_written_is_no_problem(
