@@ -61,6 +61,8 @@ class Recovery(NamedTuple):
     """Whether there is no END sentinel: the writer died, or the end of the file is lost."""
     bytes: int
     """Size of the damaged file."""
+    set_aside_as: str | None = None
+    """New path of the damaged file; None if it was not renamed."""
 
     @property
     def is_lossy(self) -> bool:
@@ -150,7 +152,7 @@ def recover_recording(
                     recovery = copy.finish(source, source.stat().st_size, now_ns)
                 renaming.enter_context(interrupts_held())
             if set_aside:
-                put_aside(source)
+                recovery = recovery._replace(set_aside_as=str(put_aside(source)))
         return recovery
 
 

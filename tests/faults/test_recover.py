@@ -1,5 +1,6 @@
 """`recover` under damage in every place: every intact chunk comes back, never an exception."""
 
+import json
 import random
 import signal
 import struct
@@ -451,9 +452,22 @@ def test_the_command_says_what_it_found(
     assert cli.main(["recover", str(path), "--set-aside", "--force"]) == code
     assert (tmp_path / "a.mcap.crashed").exists()
     assert not path.exists()
-    capsys.readouterr()
+    out = capsys.readouterr().out
+    assert out.splitlines()[-1].endswith(f"; {path} is renamed to {path}.crashed")
     assert cli.main(["recover", str(path)]) == 2
     assert cli.main(["recover", str(tmp_path / "c.mcap"), "-o", "/nowhere/at/all.mcap"]) == 2
+
+
+def test_the_name_of_a_second_file_that_is_set_aside_is_printed(
+    whole: Whole, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.mcap.crashed").write_bytes(b"as before")
+    path = damaged(tmp_path, whole.content)
+    assert cli.main(["recover", str(path), "--set-aside", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["recording"] == str(tmp_path / "a.recovered.mcap")
+    assert printed["set_aside_as"] == f"{path}.crashed-2"
+    assert (tmp_path / "a.mcap.crashed").read_bytes() == b"as before"
 
 
 def test_the_command_as_a_process(whole: Whole, tmp_path: Path) -> None:

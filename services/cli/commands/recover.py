@@ -29,7 +29,10 @@ class RecoverOptions:
         MCAP,
         flags=("-o", "--output"),
     )
-    set_aside: bool = flag("rename the damaged recording to REC.mcap.crashed afterwards")
+    set_aside: bool = flag(
+        "rename the damaged recording to REC.mcap.crashed afterwards (REC.mcap.crashed-2 if that "
+        "exists)"
+    )
     force: bool = force_option()
     json: bool = flag("print the counts as JSON")
 
@@ -50,6 +53,8 @@ def _recover(asked: RecoverOptions) -> int:
             source, target, force=asked.force, set_aside=asked.set_aside, progress=next_file()
         )
     plain = f"{target}: {describe(recovery)}"
+    if recovery.set_aside_as is not None:
+        plain += f"; {source} is renamed to {recovery.set_aside_as}"
     print(json.dumps(_as_json(target, recovery)) if asked.json else plain)
     return EXIT_LOSSY if recovery.is_lossy else EXIT_CLEAN
 
