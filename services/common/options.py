@@ -91,9 +91,12 @@ def site_option(text: str, *, group: str = "", required: bool = False) -> Any:
     return opt(text, Path, group=group, metavar="SITE.toml", required=required)
 
 
-def speed_option(default: float, *, zero: str = "", group: str = "") -> Any:
-    """Return `--speed` as a multiple of the original one; `zero` explains the value 0."""
-    what = f"playback speed as a multiple of real time{', ' + zero if zero else ''}"
+def speed_option(default: float, *, zero: str = "", other: str = "", group: str = "") -> Any:
+    """Return `--speed` as a multiple of the original one.
+
+    `zero` explains the value 0; `other`, with its punctuation, the effect of any but 1.
+    """
+    what = f"playback speed as a multiple of real time{', ' + zero if zero else ''}{other}"
     return opt(
         f"{what} (default: {default:g})",
         number("a factor", low=0 if zero else 1e-3, high=1e6),

@@ -49,7 +49,11 @@ class TruckSettings(OnTheBus):
     endpoint: str | None = endpoint_option()
     tls: Path | None = tls_option()
     realm: str = realm_option()
-    speed: float = speed_option(1.0)
+    speed: float = speed_option(
+        1.0,
+        other="; if it is not 1, the logger takes the age of the samples for a wrong clock, except "
+        "in realms sim-…",
+    )
     skip_gaps: bool = flag("skip gaps of more than 2 s, as between runs")
     vehicle: str | None = opt(
         "identifier of the vehicle to publish, where there are several", metavar="ID"

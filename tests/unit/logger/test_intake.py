@@ -187,6 +187,28 @@ def test_a_replays_old_times_say_nothing_of_clocks() -> None:
     assert intake.clock_figures() == {}
 
 
+@pytest.mark.parametrize(("realm", "is_reported"), [("live", True), ("sim-slow", False)])
+@pytest.mark.parametrize("speed", [0.5, 4.0])
+def test_a_simulated_drive_at_another_speed_is_no_drift(
+    realm: str, is_reported: bool, speed: float
+) -> None:
+    """Both are published by `driveby truck`; in realm live only a real clock can be meant."""
+    intake = make()
+    seconds = 400
+    # Faster than real, the drive ends now; slower, it begins now.
+    ahead_s = max(0.0, seconds - seconds / speed)
+    events = []
+    for number in range(seconds):
+        wall_ns = NOW_NS + round((number - ahead_s) * S)
+        now = at(number / speed)
+        sample = message(number, device_ns=number * S, wall_ns=wall_ns, realm=realm)
+        assert intake.accept(sample, now[0]) is not None
+        events += intake.report(*now)
+    assert (EventKind.CLOCK_DRIFT in kinds(events)) == is_reported
+    assert ("clock_offset_s/truck-1" in intake.clock_figures()) == is_reported
+    assert intake.lag_s() > 100.0
+
+
 def test_payload_and_attachment_must_agree() -> None:
     intake = make()
     forged = message(7)._replace(attachment=encode_identity(1, 8))
