@@ -47,6 +47,8 @@ class OpenFile:
     since_s: float
     last_s: float
     dropped_before: int
+    has_failed: bool = False
+    """Whether its END could not be written: then only `RecordingWriter.fail` may follow."""
 
 
 def synced(name: FileName, opened: OpenFile) -> Misplaced | None:
@@ -56,12 +58,24 @@ def synced(name: FileName, opened: OpenFile) -> Misplaced | None:
         return opened.file.displacement()
 
 
+def finished(
+    name: FileName, opened: OpenFile, reason: str, counts: Mapping[str, int]
+) -> WriteError | None:
+    """Write the END of a file and close it; return the error if that failed."""
+    try:
+        opened.file.finish(reason, counts)
+    except OSError as error:
+        opened.has_failed = True
+        return failure_of(name, error)
+    return None
+
+
 def close_after_failure(
     opened: OpenFile, failure: str, counts: Mapping[str, int], event: Message, *, is_failed: bool
 ) -> int | None:
     """Close a file with an event; return its lost messages, None if unknown."""
     try:
-        if is_failed:
+        if is_failed or opened.has_failed:
             return opened.file.fail(failure, counts, [event])
         opened.file.sync()
     except OSError as error:

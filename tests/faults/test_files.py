@@ -417,6 +417,58 @@ def test_rotation_neither_loses_nor_repeats(
     assert kinds == {"info", "gnss"}
 
 
+@pytest.mark.parametrize("how", ["finish", "rotate"])
+def test_files_are_closed_at_the_same_time(tmp_path: Path, how: str) -> None:
+    """A disk that takes its time for each is waited for once."""
+    is_ending = threading.Event()
+    both = threading.Barrier(2, timeout=LONGEST_S)
+
+    def sync(descriptor: int) -> None:
+        if is_ending.is_set():
+            both.wait()
+        DISK.sync(descriptor)
+
+    writer = FileWriter(place(tmp_path), disk=DISK._replace(sync=sync))
+    for message in (*fixes(3), *fixes(3, "truck-2")):
+        assert writer.put(message)
+    until(lambda: writer.written == 6)
+    is_ending.set()
+    if how == "rotate":
+        writer.rotate()
+        until(lambda: writer.take_figures()["files"] == 0 or writer.failure)
+    writer.finish("done", {})
+    assert (writer.failure, writer.dropped) == (None, 0)
+    paths = sorted(tmp_path.glob("live/*/*.mcap"))
+    assert [len(data_of([path])) for path in paths] == [3, 3]
+    reason = {"finish": "done", "rotate": "rotated: on request"}[how]
+    assert [(read_info(path).end or {})["reason"] for path in paths] == [reason] * 2
+
+
+def test_ends_that_cannot_be_written_cost_no_other_file_its_own(tmp_path: Path) -> None:
+    is_ending = threading.Event()
+
+    def sync(descriptor: int) -> None:
+        if is_ending.is_set() and "truck-2" not in str(
+            Path(f"/proc/self/fd/{descriptor}").readlink()
+        ):
+            raise OSError(5, "Input/output error")
+        DISK.sync(descriptor)
+
+    writer = FileWriter(place(tmp_path), disk=DISK._replace(sync=sync))
+    sent = [message for n in (1, 2, 3) for message in fixes(3, f"truck-{n}")]
+    for message in sent:
+        assert writer.put(message)
+    until(lambda: writer.written == len(sent))
+    is_ending.set()
+    writer.finish("done", {})
+    assert writer.failure == "recording stopped: Input/output error"
+    assert (writer.written, writer.dropped) == (len(sent), 0)
+    paths = sorted(tmp_path.glob("live/*/*.mcap"))
+    assert data_of(paths) == sent
+    assert is_closed(paths[1])
+    assert (read_info(paths[1]).end or {})["reason"] == "done"
+
+
 def test_more_trucks_in_a_day_than_files_can_be_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
