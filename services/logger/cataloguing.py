@@ -3,12 +3,14 @@
 A row requires reading the file once more, with packages that would add half of the logger's memory
 to it and never give it back. So a process of low priority writes the rows of all files that were
 closed within a minute. Those left when the logger ends are written in this process, up to a size
-that does not delay the end.
+and a time that do not delay the end.
 """
 
 import contextlib
 import logging
+import math
 import threading
+import time
 from pathlib import Path
 from queue import Empty, SimpleQueue
 
@@ -22,6 +24,8 @@ _MAX_FILES = 1000
 """Largest number of files for one process, whose arguments are limited."""
 _AT_END_BYTES = 32 << 20
 """Size of the files whose rows are written at the end, about a second of work."""
+_AT_END_S = 5.0
+"""Time for those rows after the first, as each waits twice for a disk that may be slow."""
 
 
 class Cataloguing:
@@ -40,7 +44,7 @@ class Cataloguing:
             self._closed.put(recording)
 
     def close(self) -> None:
-        """Add the rows of the last files, unless these are very large, and stop.
+        """Add the rows of the last files, unless that takes long, and stop.
 
         A process that is at work is ended.
         """
@@ -62,14 +66,16 @@ class Cataloguing:
             )
 
     def _write_last(self, recordings: list[Path]) -> int:
-        """Return the number of files that are too large."""
-        left_bytes = _AT_END_BYTES
+        """Return the number of files for which there is no time, also because they are large."""
+        left_bytes, deadline_s = _AT_END_BYTES, math.inf
         for number, recording in enumerate(recordings):
             with contextlib.suppress(FileNotFoundError):
                 left_bytes -= recording.stat().st_size
-            if left_bytes < 0:
+            if left_bytes < 0 or time.monotonic() >= deadline_s:
                 return len(recordings) - number
             catalog_closed(self._folder, recording)
+            # From here on: the first row loads the packages.
+            deadline_s = min(deadline_s, time.monotonic() + _AT_END_S)
         return 0
 
     def _take(self) -> list[Path]:

@@ -75,6 +75,19 @@ def test_large_files_do_not_hold_up_the_end(
     assert "2 closed files are not in the catalogue yet; `driveby catalog" in caplog.text
 
 
+def test_a_slow_disk_does_not_hold_up_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    monkeypatch.setattr(cataloguing, "_AT_END_S", 0.0)
+    rows = Cataloguing(tmp_path)
+    for n in range(3):
+        rows.add(closed_file(tmp_path, f"truck-{n}.mcap"))
+    rows.close()
+    assert row_names(tmp_path) == ["truck-0.mcap"]
+    assert "2 closed files are not in the catalogue yet; `driveby catalog" in caplog.text
+
+
 def test_rows_of_an_interrupted_process_are_left_to_the_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
