@@ -23,18 +23,18 @@ from studies.validation.worlds import HEADINGS, cells, lines_of, world_checks
 
 _HEAD = """# Validation of method `pre`
 
-Are the intervals reliable? This page is written by
+Are the 95 % intervals reliable? This page is written by
 
     {command} --page docs/validation.md
 
-(`make validate WORLDS={each}`); every figure on it comes from that run, of
-edition {edition} of the method. No real bridge is among them: no public record of one is known.
+(`make validate WORLDS={each}`); all its figures come from that run, of method version {edition}.
+No real bridge is among the crossings: no public recording of one is known.
 
 ## Targets
 
 {aims}
 
-Targets of effects and of an independent simulator, which have tables below, are listed where
+Targets of the tables on out-of-model effects and an independent simulator are listed only where
 missed.
 """
 
@@ -43,28 +43,28 @@ _DRAWN = """
 
 {crossings} crossings, seeds 0 to {last}. For each, every parameter of the method is drawn from its
 prior by the site file: the truck (log-normal, 15 %), EI of every element
-(log-normal, 0.55 of ln EI), mass per length (10 %), Rayleigh damping (50 %), support springs
-and how far bearings give (half-normal, or absent as likely as not), tyre damping (half-normal),
+(log-normal, 0.55 of ln EI), mass per length (10 %), Rayleigh damping (50 %), rotational restraint
+and bearing compliance (half-normal; absent in half of the draws), tyre damping (half-normal),
 wheelbase (0.2 %), gains (1 %) and delays (0.5 ms) of the channels, the total mass
 (1 %) and the gain common to all channels (1 %), the receiver's slow error (1.5 m), noise and
-latency (0.1 s), the height of the centre of gravity (15 %). No draw is cut off or thrown away.
-Biases of the sensors are 0.03 m/s², roads of ISO class A or B; 5 to 25 m/s in both directions,
-four in ten with accelerations of 0.1 to 1 m/s²; 200 to 2000 Hz; 25 to 100 µg/√Hz, declared as it
-is; one or ten fixes a second.
+latency (0.1 s), the height of the centre of gravity (15 %). No draw is truncated or discarded.
+Sensors have biases of 0.03 m/s², rates of 200 to 2000 Hz and noise of 25 to 100 µg/√Hz, correctly
+declared; receivers give one or ten fixes a second. Roads are of ISO class A or B; speeds are 5 to
+25 m/s in both directions, four in ten with accelerations of 0.1 to 1 m/s².
 
-The truth is computed on ten finite elements in each element with 40 modes and steps of 0.1 ms,
-felt through a tyre's contact patch, measured, put into messages and read by the same engine that
-reads a recording. The method shares with it neither mesh, nor time step, nor integrator, nor the
-position. What the two do share is the model: a linear half-car on a beam at rest. Whether a real
-truck and a real bridge are so is not shown here.
+The truth is computed with ten finite elements for each element, 40 modes and steps of 0.1 ms. Tyres
+average the road over their contact patch; the signals are measured, put into messages and read by
+the engine that reads recordings. The method does not share mesh, time step, integrator or exact
+position with the simulation, but it shares the model: a linear half-car on a beam at rest. Whether
+real trucks and bridges follow this model is not tested here.
 
 ![Errors, coverage, ranks and widths]({image})
 
 Errors are judged in ln EI, in which the prior is normal: z = (ln median − ln truth) over the
 standard deviation that the 2.5 and 97.5 % quantiles give. The common scale uncertainty (total mass,
-gain) is part of both the interval and the truth. The bound is the Cramér-Rao bound of the same
-rows, receiver and priors at the truth; the variance of a support spring is that of a normal cut
-off at zero there. Standard errors are between crossings.
+gain) is part of both the interval and the truth. The bound is the Cramér–Rao bound of the same
+residuals, receiver and priors at the truth, where the variance of a restraint is that of a normal
+truncated at zero. Standard errors (±) follow from the scatter between crossings.
 
 {elements}
 
@@ -78,26 +78,26 @@ off at zero there. Standard errors are between crossings.
 
 Verdicts and reasons: {reasons}.
 
-Ranks: were the intervals true, the share of the posterior that lies below the truth would be
-uniform. Each parameter is tested by χ² over ten bins; a group fails if the smallest of its
+Ranks: if the intervals are correct, the share of the posterior below the truth is uniformly
+distributed. Each parameter is tested by χ² over ten bins; a group fails if the smallest of its
 p-values times their number is below {smallest_p:g}.
 """
 
 _CONTROL = """
-## A check that can fail
+## Negative control
 
-The same crossings, seeds 0 to {last}, with the noise declared half of what it is: {good} of
-{count} are `good`, {named} of {count} have a reason for it (`noise_above_declared`,
+The same crossings, seeds 0 to {last}, with half of their noise declared: {good} of {count} are
+`good`, {named} of {count} have a reason that names the misfit (`noise_above_declared`,
 `model_misfit` or `residuals_coloured`).
 """
 
 _SCENARIOS = """
 ## The paper's scenarios
 
-One crossing each at 10 m/s over a road of class A with the errors of a receiver (1.5 m slow, 0.4
-m and 0.07 m/s white); the truck is the site file's. Road and noise are drawn for each scenario, its
-number being the seed. EI over the undamaged value, mean ± standard deviation; the paper's Table 7
-(no noise, exact position; its ± is the spread of particles) next to it.
+One crossing each at 10 m/s over a road of class A, with errors of the receiver (1.5 m slow; 0.4 m
+and 0.07 m/s white); the truck is that of the site file. Road and noise are drawn for each scenario,
+with its number as the seed. The table shows EI over the undamaged value, mean ± standard deviation,
+and the paper's Table 7 (no noise, exact position; its ± is the spread of particles).
 
 | scenario | element | truth | paper | {columns} |
 | --: | --- | --: | --: | {rules} |
@@ -107,16 +107,17 @@ number being the seed. EI over the undamaged value, mean ± standard deviation; 
 """
 
 _WORLDS = """
-## More physics than the method has
+## Out-of-model effects
 
-Crossings whose truck and bridge are drawn as above, but on free and rigid bearings and undamped
-tyres; then with one effect, or with all but the surface, torsion, left-and-right and pavement,
-which are on roads of their own (`studies/simulation/out_of_model.py` explains each and has the
-ranges, none a prior of the method). Answered is what is not rejected; covered is the share
-of the 95 % intervals of EI that hold the truth, of all that were answered and of those that are
-`good`; z is the error over the standard deviation: its mean over all elements and that of the worst
-element, its root mean square (rms), and its largest size where the verdict is `good` (max); std is
-the median relative standard deviation of EI, for the surface also over its bound (of bound).
+Trucks and bridges are drawn as above, but with free and rigid bearings and undamped tyres; then one
+effect is added, or all but surface, torsion, left-and-right and pavement, which have roads of their
+own (`studies/simulation/out_of_model.py` explains the effects and gives their ranges, none of which
+is a prior of the method). `answered` crossings are not rejected; `covered` is the share of the 95 %
+intervals of EI that contain the truth, in answered crossings and in good ones (`of good`). z is
+here the error of EI, not of ln EI, over its standard deviation: its mean over all elements and that
+of the worst element, its root mean square (`rms`), and its largest size in good crossings (`max`).
+`std` is the median relative standard deviation of EI, for the surface also over its
+bound (`of bound`).
 
 | {headings} |
 | --- |{rules}
@@ -128,8 +129,8 @@ the median relative standard deviation of EI, for the surface also over its boun
 _JUDGED = """
 ## Crossings of an independent simulator
 
-Files of a program that shares no code with this one; EI may be off by the larger of a share of its
-value and a number of standard deviations.
+The files are from a program that shares no code with this one. The error of EI may be the larger of
+a share of its value and a number of standard deviations (`allowed`).
 
 | run | verdict | χ² | at the truth | allowed | error | largest \\|z\\| | std/bound |
 | --- | --- | --: | --: | --- | --: | --: | --: |
@@ -139,22 +140,22 @@ value and a number of standard deviations.
 _NOT_JUDGED = """
 ## Crossings of an independent simulator
 
-Not judged in this run: the folder with them was not there.
+Not judged in this run: their folder does not exist.
 """
 
 _ELSEWHERE = """
 ## Other evidence
 
-Each page has its figures with their commands.
+Each page gives its figures with their commands.
 
 | what | against | page |
 | --- | --- | --- |
 | beam, modes, moving loads | closed forms, another integrator, orders of convergence | [forward problem](../studies/forward-problem.md) |
 | truck on bridge, the paper's search | the paper's tables, a simulator that shares no code | [reproduction](../studies/reproduction.md) |
-| verdicts, weights or chains | faults, one by one | [faults](../studies/faults.md) |
-| fused intervals, forecasts, weak elements | surveys simulated whole | [surveys](../studies/surveys.md) |
+| verdicts | faults, one by one | [faults](../studies/faults.md) |
+| fused intervals, forecasts, weak elements | whole simulated surveys | [surveys](../studies/surveys.md) |
 | verdicts and intervals | VBI-2D and OpenSeesPy | [other simulators](../studies/other-simulators.md) |
-| sensors left and right | a simulator with two sides | [sensors](../studies/sensors.md) |
+| sensors left and right | a simulator of both sides | [sensors](../studies/sensors.md) |
 """  # noqa: E501 - a row of Markdown is one line
 
 
