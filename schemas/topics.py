@@ -76,7 +76,7 @@ HEALTH_PERIOD_S = 60.0
 TOPICS: tuple[Topic, ...] = (
     Topic(
         "vehicle", "accel", "driveby.v1.AccelBatch", True, False, 20.0, "reliable",
-        6000, 100_000, 1 << 18, "50-100 ms of every accelerometer, at each one's own rate",
+        6000, 100_000, 1 << 18, "50-100 ms of every accelerometer, each at its own rate",
     ),
     Topic(
         "vehicle", "gnss", "driveby.v1.GnssFix", True, False, 10.0, "reliable",
@@ -84,7 +84,7 @@ TOPICS: tuple[Topic, ...] = (
     ),
     Topic(
         "vehicle", "location", "foxglove.LocationFix", True, False, 10.0, "reliable",
-        3000, 100_000, 1 << 14, "the same fix in the form that map views draw unaided",
+        3000, 100_000, 1 << 14, "the same fix in the form that map viewers draw",
     ),
     Topic(
         "vehicle", "info", "driveby.v1.VehicleInfo", True, True, None, "reliable",
@@ -112,7 +112,7 @@ TOPICS: tuple[Topic, ...] = (
     ),
     Topic(
         "service", "health", "driveby.v1.Health", False, False, 1 / HEALTH_PERIOD_S, "latest",
-        1, 1_000, 1 << 16, "state of a service: rate, lag, queue, lost, recovered, disk left",
+        1, 1_000, 1 << 16, "state of a service: rate, lag, queue, lost, recovered, free disk",
     ),
     Topic(
         "service", "progress", "driveby.v1.Progress", False, False, None, "latest",
