@@ -51,8 +51,8 @@ class IdentifyOptions:
     )
     seed: int = seed_option()
     into: Path | None = output_folder_option(
-        "store each result here as it is computed; run again to resume. Unreadable input is "
-        "listed and skipped (exit code 3)",
+        "folder that receives each result once it is computed; repeat the command to resume. "
+        "Unreadable input is listed and skipped (exit code 3)",
         group=_MANY,
     )
     scheduler: str | None = opt(

@@ -64,7 +64,9 @@ class TruckSettings(OnTheBus):
 class GatewaySettings(OnTheBus):
     """Options of `driveby gateway`: a ROS 2 router, its truck, and the bus for its data."""
 
-    what: str = positional("ros2: with rmw_zenoh, see docs/truck.md", choices=("ros2",))
+    what: str = positional(
+        "ros2: a ROS 2 truck with rmw_zenoh, see docs/truck.md", choices=("ros2",)
+    )
     ros: str = opt(
         "address of rmw_zenoh's router, e.g. tcp/127.0.0.1:7447",
         required=True,

@@ -36,7 +36,7 @@ class WorkerSettings(OnTheBus):
     site: Path = site_option("site file of trucks and bridges", required=True)
     folder: Path = folder_option("folder of the results")
     file: Path | None = output_option(
-        "single new file for the results, and its .json", "RESULTS.mcap"
+        "single new file for the results, with a .json next to it", "RESULTS.mcap"
     )
     method: str = method_option()
     processes: int = opt(

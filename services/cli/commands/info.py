@@ -40,7 +40,7 @@ class InfoOptions:
         metavar="REC.mcap|DIR",
     )
     site: Path | None = site_option("site file of the bridges (default: that of each recording)")
-    json: bool = flag("print all findings as JSON")
+    json: bool = flag("print the summary as JSON")
 
 
 def _info(options: InfoOptions) -> int:

@@ -42,7 +42,7 @@ class ReportOptions:
         "site file of the bridges (default: that of a recording in the results' folder)"
     )
     baseline: Path | None = file_option(
-        "earlier results, shown next to these with the change (default: the site file's)",
+        "earlier results to show next to these, with the change (default: those of the site file)",
         "BEFORE.json",
     )
     validations: Path | None = validations_option(

@@ -90,7 +90,7 @@ class ValidateOptions:
         "for every pair of truck and bridge in it (exit code 1 if one fails)"
     )
     json: Path | None = output_option(
-        "JSON file of the table", "OUT.json", VALIDATION_JSON, AIMS_JSON
+        "JSON file of the results", "OUT.json", VALIDATION_JSON, AIMS_JSON
     )
     figures: Path | None = output_folder_option("folder for figures")
     particles: int = opt(
@@ -148,8 +148,8 @@ class ValidateOptions:
         default=Path("build/worlds.jsonl"),
     )
     surveys: int = opt(
-        "number of fused surveys, of 8 to 16 crossings, for each of --kinds; nothing else "
-        "is then run (default: 0)",
+        "number of fused surveys, of 8 to 16 crossings, for each of --kinds; with it nothing "
+        "else is run (default: 0)",
         whole("a number of surveys", 0),
         default=0,
     )
@@ -166,7 +166,7 @@ class ValidateOptions:
         metavar="DIR",
     )
     processes: int = opt("number of processes (default: 2)", whole("processes", 1, 256), default=2)
-    page: Path | None = output_option("Markdown page of the findings", "PAGE.md", VALIDATION_PAGE)
+    page: Path | None = output_option("Markdown page of the results", "PAGE.md", VALIDATION_PAGE)
 
 
 def _validate(asked: ValidateOptions) -> int:
