@@ -39,7 +39,7 @@ class GriddedCrossing(NamedTuple):
     """Whether the tyre force is computed from the masses above it rather than from springs, dampers
     and axle; the results differ by the body equations."""
     swing_sample: int
-    """Sample of `EvaluationPoints.swing`, more than a step's reach before the entry."""
+    """Sample of `EvaluationPoints.swing`, before the entry by more than the reach of `step`."""
     torsion: TorsionBasis = NO_TORSION
     lead: Lead = NO_LEAD
     """Front axle of a truck with a tandem; "front" and "rear" are then the axles of the tandem."""

@@ -1,11 +1,11 @@
 """The four accelerations as smooth functions of time on the model's grid.
 
-Everything that the model compares is below an eighth of its own rate M, so that signals sampled at
-the sensors' rate are first converted to M. A quintic spline through the samples gives velocity and
-displacement by its antiderivatives and the jerk and its rates by its derivatives; samples that are
-too sparse are first interpolated by a windowed sinc. All of these are then low-passed equally and
-decimated. With the derivatives a channel can be shifted by a small delay without another
-interpolation, by Taylor's series.
+All residuals of the model are below an eighth of its own rate M, so signals sampled at the sensors'
+rate are first converted to M. A quintic spline through the samples gives velocity and displacement
+by its antiderivatives and the jerk and its rates by its derivatives; samples that are too sparse
+are first interpolated by a windowed sinc. All of these are then low-passed alike and decimated.
+With the derivatives a channel can be shifted by a small delay without another interpolation, by
+Taylor's series.
 """
 
 from typing import NamedTuple

@@ -1,8 +1,8 @@
 """Comparison of two optima of one crossing.
 
 Chi2 shows whether a fit explains the residuals by its own noise, but not which of two fits is
-likelier: levels of mismatch and suspension noise follow from the residuals, so that a wrong bridge
-with more noise has a chi2 of one, too. Two accepted fits are therefore compared by their posterior
+likelier: levels of mismatch and suspension noise follow from the residuals, so a wrong bridge with
+more noise has a chi2 of one, too. Two accepted fits are therefore compared by their posterior
 densities, which contain the normalisation of the noise.
 """
 
@@ -26,7 +26,7 @@ def is_better(one: Optimum, other: Optimum) -> bool:
 def minus_two_log_posterior(found: Optimum) -> float:
     """Return -2 ln of the posterior density at an optimum, up to a constant of its crossing.
 
-    The whitener W has W'W = C^-1, so that the normalisation is ln |C| = -2 ln |W|. `noise_slope`,
+    The whitener W satisfies W'W = C^-1, so the normalisation is ln |C| = -2 ln |W|. `noise_slope`,
     its gradient in a search with fixed noise, is left out.
     """
     problem = found.problem

@@ -4,7 +4,7 @@ Deflections are linear in the compliances c = EI_nominal/EI, exactly for a stati
 bridge. So with all other coordinates x, and c in place of ln EI, the residuals are r + J (x - x_0)
 far beyond their linear range in ln EI. With the log-normal priors of EI, the priors at zero and the
 point masses of absence, this density is cheap, and close to the posterior even where an element is
-known only to within a factor of several.
+known only to a factor of several.
 
 It is sampled by a Gibbs sampler: all coordinates that are conditionally normal are integrated
 out; elements are drawn by slice sampling (Neal 2003); the conditional of a coordinate that may be
@@ -95,7 +95,7 @@ def compliance_posterior(found: Optimum, inflation: float) -> CompliancePosterio
 def without_priors(
     problem: PosteriorProblem, rows: int, places: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return indices (m,) among `rows` residuals, without the priors at `places` of y."""
+    """Return the indices (m,) of `rows` residuals but the priors of the coordinates `places`."""
     # The priors' residuals come last, in the order of y up to the trajectory.
     return np.setdiff1d(np.arange(rows), rows - layout(problem).trajectory.start + places)
 

@@ -23,9 +23,9 @@ SWING_MODES = 3
 
 @inner
 def update_modes(crossing: GriddedCrossing, work: Buffers, theta: FloatArray) -> bool:
-    """Compute the modes at `theta` (p,) in the work arrays, unless they are there already.
+    """Compute the modes at `theta` (p,) in the work arrays, unless these already hold them.
 
-    Return False if there are none.
+    Return False if they are not finite.
     """
     same = True
     for i in range(FIRST_OF_BRIDGE, theta.size):

@@ -36,20 +36,20 @@ that ends it."""
 _CLEAR_FRICTION_WEIGHT = 0.05
 """Weight of the body equations below which full weight is not tried: friction is clear."""
 NO_FIT_CHI2 = 10.0
-"""Value of chi2 at five times the noise above which a strategy with full weight of the body
-equations ends and no fit is completed: right starts of 90 simulated crossings had 1.6 at most,
-wrong ones 10 to 70."""
+"""Value of chi2 at five times the noise above which no fit is completed and a strategy with full
+weight of the body equations ends: right starts of 90 simulated crossings had 1.6 at most, wrong
+ones 10 to 70."""
 _POOR_START_CHI2, WORTH_COMPLETING_CHI2 = 1.7, 5.0
-"""Values of chi2 at five times the noise above which a fit is left unfinished until the other
-offsets were tried, and is not completed before other strategies either. Accepted fits had 1.7 at
-most, and one of 50 had 3.7; fault-free crossings with mismatch had 2 to 20 without it."""
+"""Values of chi2 at five times the noise: above the first a fit is left unfinished until the other
+offsets have been tried, above the second also until other strategies have been. Accepted fits had
+1.7 at most, and one of 50 had 3.7; fault-free crossings with mismatch had 2 to 20 without it."""
 FAR_OFF_CHI2 = 200.0
-"""Value of chi2 at five times the noise, with reduced weight of the body equations, above
-which the fit is not continued, and of a first fit, above which no other offset is tried: fault-free
-crossings had 13 at most from an offset, one with a second vehicle up to 1,900."""
+"""Value of chi2 at five times the noise, with reduced weight of the body equations, above which a
+fit is not continued and, after a first fit, no other offset is tried: fault-free crossings had 13
+at most from an offset, one with a second vehicle up to 1,900."""
 HOPELESS_CHI2 = 25.0
-"""Value of chi2 after a fit above which it is repeated neither with other noise or free ends nor,
-after two offsets, from a third."""
+"""Value of chi2 above which a fit is not repeated with other noise or free ends, and above which,
+after two offsets, no third one is tried."""
 _MAX_ROUNDS, _EARLY_ROUNDS = 6, 2
 """Limit of alternating fits and noise estimates, finally and in earlier stages."""
 _MAX_STEPS, _EARLY_STEPS = 25, 8
@@ -102,7 +102,7 @@ class Optimum(NamedTuple):
     chi2_per_dof: float
     evaluations: int
     starts: int
-    """Number of offsets from which all parameters were freed."""
+    """Number of offsets from which all parameters were fitted."""
     stopped_by_friction: bool = False
     """Whether a search with full weight of the body equations was abandoned for friction."""
     stopped_by_mismatch: bool = False
@@ -163,7 +163,7 @@ def lower_bounds(
 ) -> FloatArray:
     """Return lower bounds (d,) of the steps along directions (f, d), -inf where there is none.
 
-    A restricted coordinate changes along one direction each. During the search (`is_free`)
+    Each restricted coordinate changes along one direction only. During the search (`is_free`)
     stiffness and damping coordinates may become negative, which avoids getting stuck at zero;
     bearing compliance and torsional flexibility may not.
     """
@@ -181,7 +181,7 @@ def lower_bounds(
 def evaluations_of(
     found: SearchResult[levenberg_marquardt.LMState, levenberg_marquardt.LMInfo],
 ) -> int:
-    """Return the evaluations of a search with forward differences, its first Jacobian included."""
+    """Return the number of evaluations by forward differences, the first Jacobian included."""
     return found.state.y.size + 1 + sum(info.evaluations for info in found.infos)
 
 
@@ -219,9 +219,10 @@ def fit_all(
     Negative stiffness and damping coordinates are fixed at zero, and the others brought to the
     neighbouring optimum. `normal_approximation` accounts for the remaining gradient.
 
-    The suspension residuals and their weight depend on each other: with low weight the truck need
-    not fit. So the first fit has full weight, reduced only where the body equations then leave more
-    than sensor noise. A strategy with full weight ends without optimum at clear friction.
+    The residuals of the body equations and their weight depend on each other: with low weight the
+    truck need not fit. So the first fit has full weight, which is reduced only where these
+    residuals then exceed sensor noise. A strategy with full weight ends without optimum at clear
+    friction.
     """
     front = points(problem, y[None, :]).position_m[0]
     crossing = problem.crossing

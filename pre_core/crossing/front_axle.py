@@ -12,12 +12,12 @@ Residuals w that are white but for this noise are whitened by
 
     w - C C' w,    C = U diag(1 - (1 + s²)^-1/2)^1/2,    B = U diag(s) V',
 
-because cov(w) = I + B B'. The response to the force at each knot is computed once and serves this
-and the roughness of the deck (`pavement.estimate_pavement`): the bridge's response has waves as
-short as that roughness, and would be mistaken for it. In the few bands in which the bridge
+because cov(w) = I + B B'. The response to the force at each knot is computed once and serves both
+this and the roughness of the deck (`pavement.estimate_pavement`): the bridge's response has waves
+as short as that roughness, and would be mistaken for it. In the few bands in which the bridge
 responds, the noise is many times that of the sensors; it would be mistaken for damping or for
-support springs. All runs over one lane have the same e, so that it does not average out: in a
-fusion its power counts `RUNS` times. Errors of the axle's mass and tyre add to the covariance.
+rotational restraint. All runs over one lane have the same e, which therefore does not average out:
+in a fusion its power counts `RUNS` times. Errors of the axle's mass and tyre add to the covariance.
 """
 
 from typing import Final, NamedTuple
@@ -57,7 +57,7 @@ class FrontAxleResponse(NamedTuple):
     """Covariance (K, K) in m²/s^4 of the acceleration's error at the knots, where the surface under
     the axle is as rough as off the bridge."""
     of_values: FloatArray
-    """Covariance (K, K) in m²/s^4 that displaced values of the axle cause, for its nominal mass."""
+    """Covariance (K, K) in m²/s^4 that errors of the axle's values cause, for its nominal mass."""
 
 
 def front_axle_response(problem: PosteriorProblem, y: FloatArray) -> FrontAxleResponse | None:

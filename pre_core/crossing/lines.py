@@ -1,12 +1,12 @@
 """Spectral lines in the residuals: hum of the mains, or an engine at constant speed.
 
 A sensor that picks up a steady vibration or hum adds a sinusoid to residuals which otherwise fit.
-It is neither road nor bridge and no truck explains it, so that a crossing with 0.003 m/s² of it
-ends as a misfit. Such a line is detected in the whitened residuals of a failed search, and the
-search is repeated with waves of its frequency in each kind of residual, of unknown amplitudes that
-change within a second: all residuals are projected orthogonally to these waves, which is least
-squares with uninformative amplitudes (Golub & Pereyra 1973). This loses the information within half
-a hertz of the line.
+Neither road nor bridge nor truck explains it, so a crossing with 0.003 m/s² of it ends as a misfit.
+Such a line is detected in the whitened residuals of a failed search, and the search is repeated
+with waves of its frequency in each kind of residual, of unknown amplitudes that change within a
+second: all residuals are projected orthogonally to these waves, which is least squares with
+uninformative amplitudes (Golub & Pereyra 1973). This loses the information within half a hertz of
+the line.
 
 A line is above 10 Hz, where neither body nor bridge of a short span vibrates, narrow, and as strong
 before the bridge as on and after it, unlike any response of truck or bridge to a road.

@@ -11,13 +11,13 @@ which affect the bridge but cannot be measured in one run. The levels A_j follow
 before and after the bridge. At the speed v, d is noise in time with the spectrum S_d(f/v)/v.
 
 The axles of a tandem differ so little that their roll matters: a sensor at the distance e from the
-middle of its axle reads e times the roll angle as well. The left and the right profile excite it,
-and tyres hardly damp it, so that the spectrum of an offset rises around the roll resonance. Bands
+middle of its axle reads e times the roll angle as well. The left and the right profile excite this
+roll, and tyres hardly damp it, so the spectrum of an offset rises around the roll resonance. Bands
 there have levels of their own (`with_axle_roll`); otherwise the offset would be overestimated.
 
-The Bohman window truncates the covariance of d and keeps it positive, so that the residuals'
-covariance is banded. Its half length of 5 m changes the spectrum of unequal tyres by at most 2 %,
-and that of an offset, which grows like the logarithm of the wavelength, by at most a quarter up to
+The Bohman window truncates the covariance of d and keeps it positive; the residuals' covariance is
+then banded. Its half length of 5 m changes the spectrum of unequal tyres by at most 2 %, and that
+of an offset, which grows like the logarithm of the wavelength, by at most a quarter up to
 wavelengths of 30 m.
 """
 
@@ -64,7 +64,7 @@ _NOTHING = 1e-12
 class MismatchSpectra(NamedTuple):
     """Spectra (s, g) on an even grid (g,) of cycles/m from zero, normalised at 0.1 cycles/m.
 
-    There each is one, so that a level A_j is the spectrum of its shape at 0.1 cycles/m.
+    There each is one, so a level A_j is the spectrum of its shape at 0.1 cycles/m.
     """
 
     cycles_per_m: FloatArray

@@ -8,8 +8,8 @@ acceleration noise of densities n_s, n_u enters them as
     s^2 b_i   : [(m_ii s^2 + c_s s)/k_s + 1] n_s - [c_s s/k_s + 1] n_u + [m_12 s^2/k_s] n_s'
 
 (front minus rear in the mismatch; n_s' is the noise of the other body sensor). The front axle's
-residuals are taken when its wheel was at the rear wheel's present place, so that a sensor
-that enters both counts as two independent ones.
+residuals are taken when its wheel was at the rear wheel's present place, so a sensor that enters
+both counts as two independent ones.
 
 Friction and nonlinear dampers put a random force, the suspension noise, into the body equations, of
 a level that the residuals determine (`suspension_noise_levels`). The mismatch is then computed from

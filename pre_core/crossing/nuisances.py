@@ -1,11 +1,11 @@
 """Residuals of a crossing with its nuisances integrated out: truck, trajectory, sensors.
 
-The residuals determine the nuisances so exactly that no weighted draw of all coordinates would ever
-be likely; given the bridge they are normal. So residuals are evaluated with nuisances that follow
-the bridge, and projected on what no nuisance explains. They follow it linearly, and on demand by
-one step of Gauss-Newton for each bridge: without it, a bridge metres from the optimum's offset
-would be free to move the truck to where its residuals are not linear, and fit better than any
-other.
+The residuals determine the nuisances so exactly that weighted draws of all coordinates would have
+negligible weights; given the bridge, the nuisances are normal. So residuals are evaluated with
+nuisances that follow the bridge, and projected on what no nuisance explains. The nuisances follow
+the bridge linearly, and on demand by one step of Gauss-Newton for each bridge: without it, a bridge
+metres from the optimum's offset would be free to move the truck to where its residuals are not
+linear, and fit better than any other.
 
 The vibration before the crossing is a wave of the bridge's own frequency, which moves with the
 bridge: removed at the frequency of the optimum it would leave, or take, a wave in the residuals of
@@ -46,7 +46,7 @@ class ResidualParts(NamedTuple):
     linear: NDArray[np.int64]
     """Indices (t,) of coordinates that remain and enter linearly."""
     rows: NDArray[np.int64]
-    """Indices (m,) of the residuals, without the priors of both."""
+    """Indices (m,) of the residuals, without the priors of `curved` and `linear` coordinates."""
     waves: FloatArray
     """Effect (m, q) of waves of the mismatch that remain."""
     wave_precision: FloatArray

@@ -5,9 +5,10 @@ Relative to the road's, the amplitude of the mismatch on the bridge is
     exp(r + t L(n)),   L(n) = ln(n/n_p), n limited to some waves,
 
 with normal priors of r and t about zero. Both are estimated from waves of the residuals on the
-bridge that are too short for a deflection, so that a weak element does not resemble a rough deck;
-the prior of t extends them to long waves. The noise has the expectation of the power under their
-posterior, exp(2 (r + t L) + 2 L'CL), so that what the short waves leave open widens the intervals.
+bridge that are too short for a deflection, so a weak element does not resemble a rough deck; the
+prior of t extends them to long waves. The noise has the expectation of the power under their
+posterior, exp(2 (r + t L) + 2 L'CL); the uncertainty that the short waves leave thus widens the
+intervals.
 
 A joint at an end of the deck excites both axles; only local waves differ. Where the residuals at
 an end exceed the noise, all local waves there are removed from the whitened residuals.
@@ -118,7 +119,8 @@ def fit_ratio(
     """Return (r, t) and their covariance (2, 2) from a tapered periodogram (f,).
 
     `known` (f,) is its expectation without mismatch, `shape` (f,) that of the mismatch of the road.
-    A taper correlates neighbours, so that only every other frequency counts. Fisher scoring.
+    The method is Fisher scoring. A taper correlates neighbours, so only every other frequency
+    counts.
     """
     columns = np.stack([np.ones_like(cycles_per_m), _mismatch.tilt_of(cycles_per_m)], axis=1)
     prior = np.diag([RATIO_SPREAD**-2, TILT_SPREAD**-2])

@@ -355,9 +355,9 @@ def wheel_profiles(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return chainage (m,) and profiles (m,) under both wheels there, at one point y (size,).
 
-    On the bridge only, in the order of the rear wheel's samples. A bias common to all sensors bends
-    the whole record into a parabola, which the residuals do not show at constant speed: so the
-    record's own parabola, on the bridge and off, is subtracted.
+    Chainages are on the bridge only, in the order of the rear wheel's samples. A bias common to all
+    sensors bends the whole record into a parabola, which residuals at constant speed do not show:
+    so the parabola of the whole record is subtracted.
     """
     crossing = problem.crossing
     at = points(problem, y[None, :])

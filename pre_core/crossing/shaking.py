@@ -1,9 +1,9 @@
 """Detection of a disturbance common to all sensors that is not vertical motion.
 
-Sensors mounted off the vertical by an angle measure its sine times the longitudinal or lateral
-acceleration, all equally. It is absent from the spring strokes but acts on the body's inertia: it
-appears in both body equations at the same time. Residuals of friction and dampers are specific to
-each axle.
+Sensors mounted off the vertical by an angle all measure the sine of this angle times the
+longitudinal or lateral acceleration. The spring strokes do not contain this disturbance, but the
+inertia term of the body does: it appears in both body equations at the same time. Residuals of
+friction and dampers are specific to each axle.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 """Detection of a change of a channel's delay or gain within the record, from a fit's residuals.
 
 A sensor that loses samples publishes the later ones too early: its delay changes by a step. The
-search estimates one delay and one gain for the whole record, so that a step affects truck and
-bridge instead. Residuals are linear in the signals, and a unit step of channel c at time t_0 adds
+search estimates one delay and one gain for the whole record, so a step biases truck and bridge
+instead. Residuals are linear in the signals, and a unit step of channel c at time t_0 adds
 
     g = dr/d(delay of c), of the signals from t_0 on alone,
 

@@ -1,11 +1,11 @@
 """Posterior of a crossing with profile mismatch, in the few coordinates that it hardly determines.
 
 Elements, supports and offset are determined so poorly that their posterior is neither normal nor
-near the optimum. Truck and trajectory follow them (`nuisances`) and are integrated out, so that
-these few are drawn with weights: by the residuals where both axles have tyres of one kind, and
-otherwise from a surface of them (`response_surface`). That surface is fitted twice: at points of
-the normal about the optimum, linear in c (`compliances`), and at points of the posterior on that
-first surface, both widened.
+near the optimum. Truck and trajectory follow them (`nuisances`) and are integrated out. The
+remaining few are drawn with weights: by the residuals where both axles have tyres of one kind,
+otherwise from a surface of the residuals (`response_surface`). That surface is fitted twice: at
+points of the normal about the optimum, linear in c (`compliances`), and at points of the posterior
+on that first surface, both widened.
 """
 
 from collections.abc import Callable
@@ -229,7 +229,8 @@ def draw_curved(
     """Return weighted draws (k, n + 1) of the curved coordinates and the offset.
 
     `squares` returns the sums of squares (k,) of the residuals there, without the priors of the
-    curved coordinates. Unless they `may_be_absent`, springs and bearings are present in all.
+    curved coordinates. Unless they `may_be_absent`, restraint and bearing compliance are present in
+    all draws.
     """
     kept = np.append(curved_coordinates(found), place_of_offset(found.problem))
     centres = _prior_centres(found)

@@ -32,7 +32,7 @@ def force_rms_n(force: FloatArray) -> FloatArray:
 def force_shapes(omega: FloatArray) -> FloatArray:
     """Return the spectra (shapes, f) of B(t) cos(omega_k t), B the Bohman window; maxima 1/2.
 
-    B is the half wave cos(pi t/T) convolved with itself, so that its spectrum is a square.
+    B is the half wave cos(pi t/T) convolved with itself, so its spectrum is a square.
     """
     centre = 2.0 * np.pi * _FORCE_CENTRES_HZ[:, None]
     return _bohman(omega - centre) + _bohman(omega + centre)

@@ -72,10 +72,10 @@ def wheels(
 ) -> None:
     """Compute minus the profile (`road`) and `load` of the tandem, and the front axle's `load`.
 
-    For theta (p,) and accelerations `speeding` (n,) of the truck. `body` is zero, except the second
-    one of a tandem with springs of its own: the moment about the front axle that the springs do not
-    carry, divided by its lever. The front spring's lower end is not measured. `gravity` is divided
-    by the common gain.
+    They are for theta (p,) and longitudinal accelerations `speeding` (n,) of the truck. `body` is
+    zero, except for the second row of a tandem with springs of its own: the moment about the front
+    axle that the springs do not carry, divided by its lever. The front spring's lower end is not
+    measured. `gravity` is divided by the common gain.
     """
     lead = crossing.lead
     on = shared_load(lead, theta, crossing.total_mass_kg, gap)
@@ -199,8 +199,8 @@ def _value(c: tuple[Lanes, Lanes, Lanes, Lanes], x: float) -> Lanes:
 def advance(work: Buffers, begin: int, stop: int) -> None:
     """Advance all modes under three wheels, each in one part, over samples `begin` to `stop`.
 
-    As `modal_response.advance` and `advance_with_ends`: `work.state` is updated and the deflections
-    under the wheels are added to `work.lanes`.
+    Like `modal_response.advance` and `advance_with_ends` it updates `work.state` and adds the
+    deflections under the wheels to `work.lanes`.
     """
     part = work.part[:, begin]
     last = work.cubics.shape[0] - 1

@@ -4,7 +4,7 @@ The curve is a cubic B-spline x(t) that minimises
 
     sum ((x(t_i) - x_i)/s_x)^2 + sum ((x'(t_i) - v_i)/s_v)^2 + integral (x'''/s_j)^2 dt,
 
-so that constant speed and constant acceleration cost nothing (P-splines; Eilers and Marx 1996).
+which leaves constant speed and constant acceleration unpenalised (P-splines; Eilers and Marx 1996).
 """
 
 from typing import NamedTuple

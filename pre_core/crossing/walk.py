@@ -1,7 +1,7 @@
 """Scan of longitudinal offsets: fit of the bridge at each, everything else to first order.
 
-At every offset the bridge parameters are fitted with all other columns projected out of the
-residuals, which is cheap and descends to the right offset.
+At every offset the bridge's parameters are fitted, with the effects of all others projected out of
+the residuals: this is cheap, and the fit improves towards the right offset.
 """
 
 from collections.abc import Callable
@@ -67,7 +67,7 @@ def others_effects(
 ) -> FloatArray:
     """Return an orthonormal basis (rows, f - h) of the effects of all coordinates but `held` (h,).
 
-    It is that of the residuals' derivatives at y (f,), which take f + 1 evaluations.
+    The effects are the residuals' derivatives at y (f,), which take f + 1 evaluations.
     """
     rows = tempered_residuals(problem, y, np.eye(y.size), temperature)
     here = levenberg_marquardt.initial_state(rows, np.zeros(y.size))
@@ -106,7 +106,7 @@ def scan_offsets(
 ) -> tuple[list[Placement], int]:
     """Return candidates along the road about y (size,), best first, and the evaluations.
 
-    The fit improves towards the right offset from afar, so that the scan ends beyond the best one.
+    The fit improves towards the right offset from afar, so the scan ends soon after the best one.
     The axles of a tandem are too close together for that: other minima metres away fit well enough
     to be accepted, with a wrong bridge, and all offsets that the receiver allows are scanned.
     """

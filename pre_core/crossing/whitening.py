@@ -1,8 +1,8 @@
 """Whitening: the banded Cholesky factor of the noise covariance, and its application to residuals.
 
 The residuals' noise (`crossing.noise`) is stationary with a covariance that vanishes beyond the
-filter's length and the noise's own correlation time, so that a banded factor whitens it exactly,
-ends included.
+filter's length and the noise's own correlation time, so a banded factor whitens it exactly, ends
+included.
 """
 
 from typing import NamedTuple

@@ -41,7 +41,7 @@ class Density(NamedTuple):
 
     ug_per_rthz: float
     quietest_ug_per_rthz: float
-    """Density in the quietest sixth of the band, without the bias of a least value."""
+    """Density in the quietest sixth of the band, without the bias of a minimum."""
     unevenness: float
     """Ratio of power in the loudest sixth of the band to that in the quietest: 1.6 for sensor noise
     in ten seconds at 500 Hz and less for more samples, larger for motion of wheels or frame."""

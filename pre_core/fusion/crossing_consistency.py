@@ -1,12 +1,12 @@
 """Detection of crossings that contradict the others of the same bridge.
 
 Each crossing gets its own change of the bridge's compliances, with everything else as all others
-determine it. The uncertainty of that change follows from the crossing and the others, and a bridge
-varies between crossings. The amount is unknown before the outlier, which resembles variability, is
-removed: so crossings are first tested with a usual amount. Outliers, at most a third of all, are
-accepted again if the variability of the others explains them. The most consistent crossings show
-too little variability, and each accepted one adds to it, so this repeats until none is accepted.
-The others are excluded.
+determine it. The uncertainty of that change follows from the crossing and the others, and from the
+bridge's variability. This is unknown before outliers, which resemble variability, are removed: so
+crossings are first tested with a usual one. Outliers, at most a third of all, are accepted again if
+the variability of the others explains them. The most consistent crossings show too little
+variability, and each accepted one adds to it, so this repeats until none is accepted. The others
+are excluded.
 """
 
 from collections.abc import Sequence

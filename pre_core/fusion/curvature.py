@@ -2,9 +2,9 @@
 
 With different wheel paths a single crossing determines elements only roughly, and its optimum lies
 near the priors. A normal about that point lacks the curvature from there to the truth, which is the
-same in all crossings of a survey, so that their number does not average it out. A crossing's
-likelihood therefore keeps a surface of second order (`response_surface`), compressed to the few
-significant sums of products, and fusion linearises each crossing again about the common estimate.
+same in all crossings of a survey and does not average out. A crossing's likelihood therefore keeps
+a surface of second order (`response_surface`), compressed to the few significant sums of products,
+and fusion linearises each crossing again about the common estimate.
 """
 
 from typing import NamedTuple

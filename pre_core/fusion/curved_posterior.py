@@ -1,10 +1,11 @@
 """Posterior of a bridge on the response surfaces of its crossings, without a common linearisation.
 
 Where crossings determine elements poorly, the widths of a normal about the most likely bridge are
-those of that bridge: it has no springs, and its ends are known better than those of the true one.
-A bridge with springs may be as likely and far away. So the bridge is drawn (`search.tempering`) by
-the likelihoods of all crossings at the drawn bridge itself. What is nearly linear there is
-integrated out: trucks, waves of the mismatch, changes of the bridge, and each crossing's offset.
+those of that bridge: it has no rotational restraint, and its ends are known better than those of
+the true one. A bridge with restraint may be as likely and far away. So the bridge is drawn
+(`search.tempering`) by the likelihoods of all crossings at the drawn bridge itself. What is nearly
+linear there is integrated out: trucks, waves of the mismatch, changes of the bridge, and each
+crossing's offset.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -2,8 +2,8 @@
 
 The runs of a wheel-path group are first aligned along the road: receivers err by about the length
 of the waves that show the wander. The road profile aligns them to centimetres. The shared fraction
-is the mean product of two runs' mismatches over the power that the estimated levels imply, so that
-the noise of the sensors, independent between runs, does not count as mismatch.
+is the mean product of two runs' mismatches over the power that the estimated levels imply; so
+sensor noise, which is independent between runs, does not count as mismatch.
 """
 
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """Likelihood of one crossing for bridge, truck and the long waves of its profile mismatch.
 
-It contains no prior, so that each prior counts once in a fusion. It is normal in
+It contains no prior, because each prior must count once in a fusion. It is normal in
 
 - the bridge's parameters, with c = EI_nominal/EI in place of ln EI (`crossing.compliances`),
 - the truck's, its wheelbase and the common sensor gain, which are the same in all its runs,

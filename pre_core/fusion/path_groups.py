@@ -1,8 +1,8 @@
 """Wheel-path groups: runs of one truck in one direction, and their shared mismatch.
 
-Like the truck, the long waves of the shared part do not average out. The shared fraction follows
-from the footprints and the lateral wander of the runs, which the residuals before and after the
-bridge determine.
+Like errors of the truck, the long waves of the shared part do not average out. The shared fraction
+follows from the footprints and the lateral wander of the runs, which the residuals before and after
+the bridge determine.
 """
 
 from collections.abc import Mapping, Sequence

@@ -2,7 +2,7 @@
 
 Fusion assumes the same truck parameters in all crossings of a truck, and each crossing determines
 some of them to a thousandth. A crossing by another truck under this name, even one of the same
-make, biases all of them and the bridge; alone it may look good. So each truck's crossings are
+make, biases all of them and the bridge; judged alone it may be good. So each truck's crossings are
 compared first by their truck parameters: every one with all others, each with its own bridge and
 waves, which may differ. The most distant one is excluded and the rest compared again, until they
 agree.

@@ -1,9 +1,8 @@
 """Eigenvalues and eigenvectors of small symmetric matrices, one or four at once.
 
 A LAPACK call for one 14 x 14 matrix costs more than the time integration that it serves. Cyclic
-Jacobi rotations (Golub and Van Loan, Matrix Computations, section 8.5) are branch-free, so that
-four matrices share the vector registers. They are fast here because the matrices are nearly
-diagonal.
+Jacobi rotations (Golub and Van Loan, Matrix Computations, section 8.5) are branch-free, so four
+matrices share the vector registers. They are fast here because the matrices are nearly diagonal.
 """
 
 import numpy as np

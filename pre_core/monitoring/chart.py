@@ -5,10 +5,10 @@ A step delta of ln EI in period k adds G(t, k) delta to every later innovation o
 
     G = I - H F,    F <- Phi F + W G,
 
-H the observation, Phi the state-transition matrix, W the Kalman gain. So no filter has to run for a
-change: sums of G' S^-1 G and G' S^-1 e suffice. With delta ~ N(0, s^2) of one element j, L_jk is
-the ratio of the densities with and without it, the scales of the usual changes integrated out in
-both. The Shiryaev-Roberts statistic
+H the observation, Phi the state-transition matrix, W the Kalman gain. So no filter has to be run
+for each possible change: sums of G' S^-1 G and G' S^-1 e suffice. With delta ~ N(0, s^2) of one
+element j, L_jk is the ratio of the densities with and without it, the scales of the usual changes
+integrated out in both. The Shiryaev-Roberts statistic
 
     R_t = sum over k of the mean over j of L_jk(t)
 

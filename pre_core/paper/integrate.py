@@ -1,8 +1,8 @@
 """Integration of accelerations to velocities and displacements.
 
 The paper integrates with Newmark's average acceleration, which reproduces a simulation by the same
-scheme and step exactly, so that its own error is hidden. Real sensors do not sample by Newmark:
-there the antiderivative of a cubic spline is far better (studies/reproduction.md measures both).
+scheme and step exactly and thus hides its own error. For samples of real sensors the antiderivative
+of a cubic spline is far better (studies/reproduction.md measures both).
 """
 
 from typing import NamedTuple

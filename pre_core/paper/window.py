@@ -20,9 +20,9 @@ _STENCIL = 2  # samples to either side that the cubic interpolation needs
 
 
 class MeasuredCrossing(NamedTuple):
-    """Signals of one crossing, and what is known of truck, bridge and start.
+    """Signals of one crossing, and the known data of truck, bridge and start.
 
-    N samples evenly spaced in time by `step_s`.
+    There are N samples, `step_s` apart.
     """
 
     acceleration_m_per_s2: FloatArray  # (4, N)

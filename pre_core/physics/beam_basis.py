@@ -6,9 +6,9 @@ is the bilinear transform of its transfer function,
     b_0 q[n] + b_1 q[n-1] + b_2 q[n-2] = p[n] + 2 p[n-1] + p[n-2],
     b_0 = a^2 + a c + lambda,  b_1 = 2 (lambda - a^2),  b_2 = a^2 - a c + lambda,  a = 2/step,
 
-so that a mode costs a few multiplications per step. The recursion here is the direct form II, w[n]
-= p[n] - (b_1 w[n-1] + b_2 w[n-2])/b_0, q[n] = (w[n] + 2 w[n-1] + w[n-2])/b_0, with 1/b_0 split
-evenly into the mode shapes. It starts from rest before the first wheel arrives.
+so a mode costs a few multiplications per step. The recursion here is the direct form II, w[n] =
+p[n] - (b_1 w[n-1] + b_2 w[n-2])/b_0, q[n] = (w[n] + 2 w[n-1] + w[n-2])/b_0, with 1/b_0 split evenly
+into the mode shapes. It starts from rest before the first wheel arrives.
 
 The march keeps w and its change d[n] = w[n] - w[n-1],
 
@@ -120,9 +120,8 @@ def beam_basis(
 def change_basis(basis: BeamBasis, theta: FloatArray) -> BeamBasis:
     """Return the same beam in coordinates that diagonalise the bridge `theta` (p,).
 
-    Bridges near it are then nearly diagonal, so that their modes are quick to find. Every mode
-    rises from the start: the sign of an eigenvector is arbitrary, but initial vibration depends on
-    it.
+    Bridges near it are then nearly diagonal, and their modes are quick to compute. Every mode rises
+    from the start: the sign of an eigenvector is arbitrary, but initial vibration depends on it.
     """
     factors = stiffness_factors(theta, basis.stiffness.shape[0])
     _, shapes = eigh(np.tensordot(factors, basis.stiffness, axes=1))

@@ -91,8 +91,8 @@ def span_m(beam: Beam) -> float:
 def element_mass(length_m: float, coupling_sign: float = 1.0) -> FloatArray:
     """Return the consistent mass matrix (4, 4) of a Hermite element of 1 kg/m.
 
-    `coupling_sign` = -1 flips the terms of 13 l/420. It is wrong; it is here because the bridge
-    frequencies of the paper's Table 5 result from it (studies/reproduction.md).
+    `coupling_sign` = -1 flips the terms of 13 l/420: an error that reproduces the bridge
+    frequencies of the paper's Table 5 (studies/reproduction.md).
     """
     s = length_m
     t = coupling_sign * 13.0 * s

@@ -1,8 +1,8 @@
 """Free vibration of the bridge after a constant force has crossed it and left.
 
 Each mode is an oscillator under -W phi(x(t)), which along an element is a cubic polynomial in time.
-Particular solution and free motion are known in closed form, so that the result does not depend on
-a time step.
+Particular solution and free motion are known in closed form, so the result does not depend on a
+time step.
 """
 
 import numpy as np

@@ -6,7 +6,7 @@ one-sided amplitude density d in ug/sqrt(Hz) with a corner frequency f_c: its po
 
     S(f) = (d g 1e-6)^2 (1 + f_c/f),
 
-so that white noise at the output rate f_s has the standard deviation d sqrt(f_s/2).
+so white noise at the output rate f_s has the standard deviation d sqrt(f_s/2).
 """
 
 from itertools import accumulate

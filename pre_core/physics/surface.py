@@ -95,8 +95,9 @@ def between_run_cross_spectrum(
 ) -> FloatArray:
     """Return the one-sided cross spectrum (f,) between two runs of the difference in `spectra`.
 
-    The path of each run deviates laterally by a normal of standard deviation `wander_m`, so that
-    two are apart by sqrt(2) of it: lateral waves are multiplied by exp(-(2 pi n_y w)²).
+    The path of each run deviates laterally by a normal of standard deviation `wander_m`, the
+    distance of two by one of sqrt(2) times that: lateral waves are multiplied by exp(-(2 pi n_y
+    w)²).
     """
     at_front, at_rear, n_y = _patches_and_waves(front, rear, n)
     both = np.exp(-((2.0 * np.pi * n_y * wander_m) ** 2))

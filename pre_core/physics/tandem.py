@@ -1,15 +1,15 @@
 """Contact forces of a truck with a tandem behind its front axle.
 
 An equaliser makes the two axles of the tandem share one spring force F_b in the ratio rho : 1 -
-rho, so that this force acts on the body at o_b = rho o_2 + (1 - rho) o_3. Heave and pitch then
-determine both spring forces without any spring,
+rho, so this force acts on the body at o_b = rho o_2 + (1 - rho) o_3. Heave and pitch then determine
+both spring forces without the springs' parameters,
 
     F_1 + F_b = m_s z'',    d_1 F_1 + (d_1 - o_b) F_b = I theta'' - T,    T = M a h,
 
 whatever friction there is. With the readings a_1 and a_2 of the body above the front axle and at
 the distance D_0 behind it, z'' = (1 - d_1/D_0) a_1 + d_1/D_0 a_2 and theta'' = (a_1 - a_2)/D_0; the
-pitch inertia is I = kappa m_s d_1 (D_0 - d_1). The forces are proportional to 1/o_b, so that o_b =
-D_0 gives the half-car's m_11, m_22 and m_12 (`vehicle.masses_above_axles`).
+pitch inertia is I = kappa m_s d_1 (D_0 - d_1). The forces are proportional to 1/o_b; o_b = D_0
+gives the half-car's m_11, m_22 and m_12 (`vehicle.masses_above_axles`).
 
 Where each axle has springs of its own, inertia determines only the moment of both forces about the
 front axle, o_2 F_2 + o_3 F_3 = o_b F_b. The remaining force comes from the law of the springs,
@@ -21,7 +21,7 @@ moment,
 Friction f_i, which the law leaves out, then appears in the moment as o_2 f_2 + o_3 f_3, and remains
 as a force q on axle 2 and -q o_2/o_3 on axle 3, q = o_3 (o_3 f_2 - o_2 f_3)/(o_2² + o_3²). Friction
 of both axles that is independent and equally strong makes the two uncorrelated.
-(`Lead.is_equalised` selects.)
+(`Lead.is_equalised` selects the case.)
 """
 
 from typing import NamedTuple

@@ -63,8 +63,8 @@ def tempered_draws(
     """Return draws (snapshots * count, d) of a density, from a normal that is wider.
 
     The normal has the `mean` (d,) and the `covariance` (d, d). The draws of a snapshot are
-    independent of each other but for resampling, and follow those of the one before by moves at the
-    target. `progress` is called with the share that is done.
+    independent of each other except for resampling, and follow those of the previous one by moves
+    at the target. `progress` is called with the completed share.
     """
     wide = _Wide(mean, np.asarray(np.linalg.cholesky(covariance)))
     x = mean + rng.standard_normal((count, mean.size)) @ wide.root.T

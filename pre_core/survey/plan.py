@@ -1,15 +1,15 @@
 """Information of a planned survey: likelihoods times numbers of crossings, plus priors.
 
 One crossing of the nominal truck over the nominal bridge, simulated without the noise that the
-model contains, has the mean information of a real one: J'J of its whitened residuals does
-not depend on the noise realisation. Deflection is linear in the compliances c = EI_nominal/EI
-(`crossing.compliances`), so that this is also the information on a damaged bridge.
+model contains, has the mean information of a real one: J'J of its whitened residuals does not
+depend on the noise realisation. Deflection is linear in the compliances c = EI_nominal/EI
+(`crossing.compliances`), so this is also the information on a damaged bridge.
 
 Crossings of a wheel-path group share a part of the profile mismatch (`fusion.joint`): it has
-coordinates of its own, once for all of them, so that the number of crossings does not average it
-out. The variables of a single crossing (truck, trajectory, delays, its part of the mismatch) are
-integrated out of each. A common scale of all elements (total mass, gain of all sensors) is not
-observable: a comparison with nominal values has to add it.
+coordinates of its own, once for all of them, and does not average out. The variables of a single
+crossing (truck, trajectory, delays, its part of the mismatch) are integrated out of each. A common
+scale of all elements (total mass, gain of all sensors) is not observable: a comparison with nominal
+values has to add it.
 """
 
 from collections.abc import Sequence
