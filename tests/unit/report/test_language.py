@@ -70,6 +70,15 @@ def test_german_remedy_names_what_the_english_one_names(code: Reason) -> None:
         assert any(word in german for word in words) == is_named, f"{english}: {german}"
 
 
+@pytest.mark.parametrize(("language", "cause"), [(ENGLISH, "receiver"), (GERMAN, "Empfänger")])
+def test_remedy_of_a_failed_search_names_receiver_errors(language: Language, cause: str) -> None:
+    """Least squares have no model of them; pre has one."""
+    remedy = language.advice[Reason.NOT_CONVERGED]
+    at = [remedy.find(word) for word in ("least_squares", cause, " pre")]
+    assert -1 not in at
+    assert at == sorted(at)
+
+
 def test_numbers_are_written_as_in_the_language() -> None:
     assert GERMAN.number(-1234.5, ",.1f") == "−1.234,5"
     assert ENGLISH.number(-1234.5, ",.1f") == "−1,234.5"
