@@ -38,6 +38,7 @@ from services.viewer.drawing import (
     mark_bridge,
     simplify_axes,
     simplify_numbers,
+    wrapped,
     write_centred,
     write_figure,
 )
@@ -291,9 +292,7 @@ def _heading(bridge: BridgeView) -> list[str]:
         sentences = f"No finding: none of {number} crossings could be used."
         if number == 1:
             sentences = "No finding: the only crossing could not be used."
-    unbroken = (doubt + sentences).replace(" %", "\u00a0%")
-    lines = textwrap.wrap(unbroken, 112, max_lines=6, placeholder=" …")
-    return [line.replace("\u00a0", " ") for line in lines]
+    return wrapped(doubt + sentences, 112, 6)
 
 
 def _doubt(bridge: BridgeView) -> str:

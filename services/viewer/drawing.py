@@ -46,12 +46,11 @@ _SVG_METADATA = ("Date", "Creator", "Format", "Type")
 _CHARACTERS = 118
 """Maximum length of a line of reasons between the figure's edges."""
 _MAX_REASON_LINES = 6
-"""Maximum number of lines of reasons, more than three of the longest take."""
+"""Maximum number of lines of reasons or a finding, more than three of the longest take."""
 REASON_LINE_IN = 0.15
-"""Height of a line of reasons."""
-_BESIDE_VERDICT = 110
-"""Maximum length of a finding next to the word of a good verdict."""
-_OMITTED = " …"
+"""Height of a line of reasons or a finding."""
+_BESIDE_VERDICT = 108
+"""Maximum length of a line of a finding next to the word of a good verdict."""
 ABOVE_LEGEND_PT = 22.0
 """Distance of the title from the panel, with the legend between them, in points."""
 
@@ -104,18 +103,26 @@ def figure_bytes(figure: Figure, form: str, *, dpi: int = DPI) -> bytes:
     return buffer.getvalue()
 
 
-def _beside_verdict(sentences: Sequence[str]) -> str:
-    """Return the first sentence with a note on the others, which costs no part of it.
+def finding_lines(sentences: Sequence[str]) -> list[str]:
+    """Return the lines of a finding: whole sentences, with a note on those for which room lacks.
 
     A bare number of the others would read as one of weak elements.
     """
-    first, others = sentences[0], len(sentences) - 1
-    if not others:
-        return shortened(first, _BESIDE_VERDICT)
-    if len(first) > _BESIDE_VERDICT - len(_OMITTED):
-        return shortened(first, _BESIDE_VERDICT - len(_OMITTED))
-    note = f" (and {count_of(others, 'more sentence')})"
-    return first + (note if len(first) + len(note) <= _BESIDE_VERDICT else _OMITTED)
+    lines: list[str] = []
+    for shown in range(len(sentences), 0, -1):
+        others = len(sentences) - shown
+        note = [f"(and {count_of(others, 'more sentence')})"] if others else []
+        lines = wrapped(" ".join([*sentences[:shown], *note]), _BESIDE_VERDICT)
+        if len(lines) <= _MAX_REASON_LINES:
+            break
+    return lines
+
+
+def wrapped(text: str, width: int, most: int | None = None) -> list[str]:
+    """Return the lines of a text, at most `most`; a number stays with its per cent sign."""
+    unbroken = text.replace(" %", "\u00a0%")
+    lines = textwrap.wrap(unbroken, width, max_lines=most, placeholder=" …")
+    return [line.replace("\u00a0", " ") for line in lines]
 
 
 def draw_verdict(
@@ -127,15 +134,16 @@ def draw_verdict(
 ) -> None:
     """Write the verdict below a heading: a word if it is good, a banner with reasons if not.
 
-    The first of the `sentences` stands next to a good one, with a note on the others.
+    The `sentences` stand next to a good one.
     """
     words: dict[str, Any] = {"fontsize": 9.5, "va": "top"}
     if verdict == "good":
         colour = VERDICT_COLOURS["good"]
         figure.text(LEFT, top, "verdict: good", color=colour, fontweight="bold", **words)
         if sentences:
-            short: dict[str, Any] = {"fontsize": 8.3, "va": "top", "parse_math": False}
-            figure.text(LEFT + 0.12, top, _beside_verdict(sentences), color=INK, **short)
+            finding = "\n".join(finding_lines(sentences))
+            small: dict[str, Any] = {"fontsize": 8.3, "va": "top", "parse_math": False}
+            figure.text(LEFT + 0.12, top, finding, color=INK, **small)
         return
     lines = reason_lines(verdict, reasons)
     height = (0.40 + REASON_LINE_IN * (len(lines) - 1)) / figure.get_figheight()
@@ -165,14 +173,6 @@ def reason_lines(verdict: str, reasons: Sequence[str]) -> list[str]:
     """
     most = 1 if verdict == "rejected" else _MAX_REASON_LINES
     return textwrap.wrap(" ".join(reasons), _CHARACTERS, max_lines=most, placeholder=" …") or [""]
-
-
-def shortened(sentence: str, width: int) -> str:
-    """Return a sentence of at most `width` characters; an interval is left out as a whole."""
-    if len(sentence) <= width:
-        return sentence
-    without = sentence.partition(" (95 % interval")[0]
-    return textwrap.shorten(f"{without} …", width=width, placeholder=" …")
 
 
 class BarPlaces(NamedTuple):

@@ -41,6 +41,7 @@ from services.viewer.drawing import (
     bar_places,
     draw_bars,
     draw_verdict,
+    finding_lines,
     legend_beside_title,
     mark_bridge,
     reason_lines,
@@ -110,14 +111,9 @@ def draw_crossing(
 ) -> Figure:
     """Return the figure, to be drawn in `STYLE`."""
     has_road = crossing.road is not None or road_truth is not None
-    height_in = HEIGHT_IN if has_road else _HEIGHT_WITHOUT_ROAD_IN
-    heading_in = _HEADING_IN
-    if crossing.verdict != "good":  # the banner has two lines or more
-        more = len(reason_lines(crossing.verdict, crossing.reason_texts)) - 1
-        banner_in = _BANNER_IN + REASON_LINE_IN * more
-        height_in, heading_in = height_in + banner_in, heading_in + banner_in
-    if _is_change(comparison_of(crossing, baseline)):  # the title is above the legend
-        height_in, heading_in = height_in + _LEGEND_IN, heading_in + _LEGEND_IN
+    more_in = _more_heading_in(crossing, baseline)
+    height_in = more_in + (HEIGHT_IN if has_road else _HEIGHT_WITHOUT_ROAD_IN)
+    heading_in = more_in + _HEADING_IN
     figure = Figure(figsize=(WIDTH_IN, height_in), facecolor="white")
     FigureCanvasAgg(figure)
     ratios = (3.0, 2.0, 1.15) if has_road else (1.0,)
@@ -147,6 +143,17 @@ def draw_crossing(
     rigidity.set_xlim(*_chainage_limits(crossing))
     panels[-1].set_xlabel("chainage from the start of the bridge (m)")
     return figure
+
+
+def _more_heading_in(crossing: CrossingView, baseline: Estimate | None) -> float:
+    """Return the height that more than a line of finding, a banner and a legend take."""
+    found = comparison_of(crossing, baseline)
+    legend_in = _LEGEND_IN if _is_change(found) else 0.0  # the title is above the legend
+    if crossing.verdict == "good":
+        lines = finding_lines(describe_crossing(crossing, found))
+        return legend_in + REASON_LINE_IN * max(0, len(lines) - 1)
+    lines = reason_lines(crossing.verdict, crossing.reason_texts)
+    return legend_in + _BANNER_IN + REASON_LINE_IN * (len(lines) - 1)
 
 
 def _draw_heading(figure: Figure, crossing: CrossingView, baseline: Estimate | None) -> None:

@@ -16,8 +16,13 @@ from matplotlib.patches import Rectangle
 from schemas.reasons import Reason
 from services.common.errors import InputError
 from services.common.language import ENGLISH
-from services.viewer.crossing_view import CrossingView, RoadView
-from services.viewer.drawing import STYLE, shortened
+from services.viewer.crossing_view import (
+    CrossingView,
+    RoadView,
+    comparison_of,
+    describe_crossing,
+)
+from services.viewer.drawing import STYLE, finding_lines
 from services.viewer.figure import crossing_figure, draw_crossing
 from tests.unit.words import assert_words_apart, words
 
@@ -217,10 +222,30 @@ def test_profiles_of_a_tandem_are_named_by_axle_number() -> None:
     assert {"profile of the front wheel", "profile of the rear wheel", "front − rear"} < of_two
 
 
-def test_a_finding_is_cut_before_its_interval_or_not_at_all() -> None:
-    finding = (
-        "Element 4, 12.9 to 17.1 m: 60 % less stiff than the others (95 % interval 60 to 61 %)."
-    )
-    assert shortened(finding, 110) == finding
-    assert shortened(finding, 80) == "Element 4, 12.9 to 17.1 m: 60 % less stiff than the others …"
-    assert shortened(finding, 40) == "Element 4, 12.9 to 17.1 m: 60 % less …"
+def test_whole_finding_is_written_next_to_a_good_verdict() -> None:
+    crossing = view(method="pre")
+    sentences = describe_crossing(crossing, comparison_of(crossing))
+    assert len(sentences) > 2
+    figure = draw(crossing)
+    written = " ".join(" ".join(text.get_text() for text in words(figure)).split())
+    assert " ".join(sentences) in written
+    assert "…" not in written
+    assert_words_apart(figure)
+
+
+@pytest.mark.parametrize("length", range(60, 130))
+def test_finding_is_wrapped_without_losing_a_word(length: int) -> None:
+    first = "x" * (length - 30) + " (95 % interval 59 to 61 %)."
+    lines = finding_lines([first, "b", "c"])
+    assert " ".join(lines) == f"{first} b c"
+    assert max(map(len, lines)) <= 108
+    assert not any(line.startswith("%") for line in lines)
+
+
+def test_finding_of_many_elements_ends_with_a_whole_sentence_and_a_note() -> None:
+    every = [f"Element {n}: {'x' * 60} (95 % interval 59 to 61 %)." for n in range(1, 21)]
+    lines = finding_lines(every)
+    assert len(lines) == 6
+    text = " ".join(lines)
+    shown = text.count("Element")
+    assert text == " ".join([*every[:shown], f"(and {20 - shown} more sentences)"])

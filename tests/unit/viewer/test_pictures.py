@@ -21,7 +21,7 @@ from services.viewer.bridge_figure import _heading, draw_bridge
 from services.viewer.bridge_view import BridgeView, view_of_bridge
 from services.viewer.crossing_view import comparison_of, view_of_crossing
 from services.viewer.crossings_figure import draw_crossings
-from services.viewer.drawing import STYLE, _beside_verdict
+from services.viewer.drawing import STYLE
 from services.viewer.figure import draw_crossing
 from services.viewer.panels.verdict import verdict_markdown
 from services.viewer.pictures import write_pictures
@@ -277,21 +277,6 @@ def test_a_good_crossing_says_what_is_weak_and_by_how_much(site: Site) -> None:
     )
     assert "% less" not in output
     assert ENGLISH.text("all.others", within=1) in output
-
-
-@pytest.mark.parametrize(
-    ("first", "written_as"),
-    [
-        (60, "(and 2 more sentences)"),
-        (95, "…"),  # not "(and 2 more)", which reads as two more weak elements
-    ],
-)
-def test_number_of_other_sentences_costs_no_interval(first: int, written_as: str) -> None:
-    sentence = "x" * (first - 30) + " (95 % interval 59 to 61 %).  "
-    assert _beside_verdict([sentence, "b", "c"]) == f"{sentence} {written_as}"
-    long = "x" * 70 + " less (95 % interval 59 to 61 %), by 2 standard deviations of the others."
-    assert _beside_verdict([long, "b", "c"]) == "x" * 70 + " less …"
-    assert _beside_verdict([sentence]) == sentence
 
 
 def test_what_is_not_resolved_is_an_empty_bar_and_agrees_with_nothing(site: Site) -> None:
