@@ -146,7 +146,7 @@ def draw_verdict(
             figure.text(LEFT + 0.12, top, finding, color=INK, **small)
         return
     lines = reason_lines(verdict, reasons)
-    height = (0.40 + REASON_LINE_IN * (len(lines) - 1)) / figure.get_figheight()
+    height = banner_height_in(lines) / figure.get_figheight()
     figure.add_artist(
         FancyBboxPatch(
             (LEFT + 0.004, top - height + 0.004),
@@ -164,6 +164,11 @@ def draw_verdict(
     figure.text(LEFT + 0.16, top, _NOTES[verdict], color=INK, **words)
     text, top = "\n".join(lines), top - 0.165 / figure.get_figheight()
     figure.text(LEFT + 0.01, top, text, fontsize=8.5, color=INK, va="top", parse_math=False)
+
+
+def banner_height_in(lines: Sequence[str]) -> float:
+    """Return the height of a banner with these lines of reasons, in inches."""
+    return 0.40 + REASON_LINE_IN * (len(lines) - 1)
 
 
 def reason_lines(verdict: str, reasons: Sequence[str]) -> list[str]:

@@ -38,6 +38,7 @@ from services.viewer.drawing import (
     TRUTH_MARKER,
     WIDTH_IN,
     add_ratio_axis,
+    banner_height_in,
     bar_places,
     draw_bars,
     draw_verdict,
@@ -68,6 +69,10 @@ _HEIGHT_WITHOUT_ROAD_IN = 4.4
 _HEADING_IN, _BANNER_IN = 1.17, 0.36
 """Height of the heading above the first panel, and of a banner in addition."""
 _LEGEND_IN = 0.21
+_VERDICT_IN = 0.65
+"""Distance of the verdict from the figure's top."""
+_EXPLANATION_LINE_IN, _EXPLANATION_GAP_IN = 0.165, 0.1
+"""Height of a line that explains a rejection above the panels, and of the gap to the banner."""
 
 
 def crossing_figure(
@@ -111,7 +116,9 @@ def draw_crossing(
 ) -> Figure:
     """Return the figure, to be drawn in `STYLE`."""
     has_road = crossing.road is not None or road_truth is not None
-    more_in = _more_heading_in(crossing, baseline)
+    # The truth needs the panel in which a rejection is explained otherwise.
+    explanation = _explanation(crossing) if element_truth is not None else []
+    more_in = _more_heading_in(crossing, baseline, explanation)
     height_in = more_in + (HEIGHT_IN if has_road else _HEIGHT_WITHOUT_ROAD_IN)
     heading_in = more_in + _HEADING_IN
     figure = Figure(figsize=(WIDTH_IN, height_in), facecolor="white")
@@ -130,7 +137,7 @@ def draw_crossing(
     rigidity = figure.add_subplot(grid[0])
     panels = [rigidity]
     panels += [figure.add_subplot(grid[n], sharex=rigidity) for n in range(1, len(ratios))]
-    _draw_heading(figure, crossing, baseline)
+    _draw_heading(figure, crossing, baseline, explanation)
     _draw_rigidity(rigidity, crossing, element_truth, baseline)
     if has_road:
         _draw_profiles(panels[1], crossing, road_truth)
@@ -145,18 +152,26 @@ def draw_crossing(
     return figure
 
 
-def _more_heading_in(crossing: CrossingView, baseline: Estimate | None) -> float:
-    """Return the height that more than a line of finding, a banner and a legend take."""
+def _more_heading_in(
+    crossing: CrossingView, baseline: Estimate | None, explanation: list[str]
+) -> float:
+    """Return the height of all but a line of finding: banner, explanation and legend."""
     found = comparison_of(crossing, baseline)
     legend_in = _LEGEND_IN if _is_change(found) else 0.0  # the title is above the legend
     if crossing.verdict == "good":
         lines = finding_lines(describe_crossing(crossing, found))
         return legend_in + REASON_LINE_IN * max(0, len(lines) - 1)
     lines = reason_lines(crossing.verdict, crossing.reason_texts)
-    return legend_in + _BANNER_IN + REASON_LINE_IN * (len(lines) - 1)
+    banner_in = _BANNER_IN + REASON_LINE_IN * (len(lines) - 1)
+    if not explanation:
+        return legend_in + banner_in
+    gap_in = _EXPLANATION_GAP_IN
+    return legend_in + banner_in + gap_in + _EXPLANATION_LINE_IN * len(explanation)
 
 
-def _draw_heading(figure: Figure, crossing: CrossingView, baseline: Estimate | None) -> None:
+def _draw_heading(
+    figure: Figure, crossing: CrossingView, baseline: Estimate | None, explanation: list[str]
+) -> None:
     inch = 1.0 / figure.get_figheight()
     title = "Stiffness and road profile from one crossing alone (not fused)"
     figure.text(LEFT, 1.0 - 0.18 * inch, title, fontsize=14, fontweight="bold", va="top")
@@ -165,7 +180,13 @@ def _draw_heading(figure: Figure, crossing: CrossingView, baseline: Estimate | N
     figure.text(LEFT, 1.0 - 0.455 * inch, summary, parse_math=False, **small)
     reasons = crossing.reason_texts
     sentences = describe_crossing(crossing, comparison_of(crossing, baseline))
-    draw_verdict(figure, crossing.verdict, reasons, 1.0 - 0.65 * inch, sentences)
+    draw_verdict(figure, crossing.verdict, reasons, 1.0 - _VERDICT_IN * inch, sentences)
+    if explanation:
+        lines = reason_lines(crossing.verdict, reasons)
+        top_in = _VERDICT_IN + banner_height_in(lines) + _EXPLANATION_GAP_IN
+        text = "\n".join(explanation)
+        words: dict[str, Any] = {"fontsize": 9.5, "color": INK, "va": "top", "parse_math": False}
+        figure.text(LEFT, 1.0 - top_in * inch, text, **words)
 
 
 def _draw_rigidity(
@@ -189,11 +210,11 @@ def _draw_rigidity(
         beside = centres - 0.22 * np.diff(edges)
         axes.plot(beside, true_values, label="truth", zorder=9, **TRUTH_MARKER)
         top = max(top, 1.1 * float(true_values.max()))
-    if crossing.rigidity_nm2 is None:
-        _write_rejection(axes, crossing)
-    else:
+    if crossing.rigidity_nm2 is not None:
         highest = _draw_estimate(axes, crossing, found, baseline if is_change else None)
         top = end_with_names(axes, max(top, highest))
+    elif truth is None:
+        write_centred(axes, "\n".join(_explanation(crossing)))
     axes.set_ylim(0.0, top)
     legend_beside_title(axes)
     if not is_change:
@@ -246,8 +267,10 @@ def _draw_profiles(axes: Axes, crossing: CrossingView, truth: tuple[Floats, Floa
     if truth is not None:
         axes.plot(truth[0], truth[1] * 1e3, color="#b9c0c7", linewidth=5.0, label="truth")
     road = crossing.road
-    if road is None:
+    if road is None and truth is None:
         _leave_empty(axes)
+    elif road is None:
+        axes.set_title("Road profile (none was estimated)")
     else:
         axes.plot(
             road.x_m,
@@ -320,15 +343,17 @@ def _unit_of_length(largest_m: float) -> tuple[str, float]:
     return ("µm", 1e6) if largest_m >= 1e-7 else ("nm", 1e9)
 
 
-def _write_rejection(axes: Axes, crossing: CrossingView) -> None:
-    """Write all reasons, which the heading may shorten, and what to do next."""
+def _explanation(crossing: CrossingView) -> list[str]:
+    """Return all reasons of a rejection, which the banner may shorten, and what to do next."""
+    if crossing.rigidity_nm2 is not None:
+        return []
     advice = dict.fromkeys(ENGLISH.advice[Reason(code)] for code in crossing.reasons)
     why, then = (
         [line for text in texts for line in textwrap.wrap(f"• {text}", 95, subsequent_indent="  ")]
         for texts in (crossing.reason_texts, advice)
     )
     lines = ["No estimate: the crossing was rejected.", *why]
-    write_centred(axes, "\n".join([*lines, "What to do next:", *then] if then else lines))
+    return [*lines, "What to do next:", *then] if then else lines
 
 
 def _leave_empty(axes: Axes) -> None:

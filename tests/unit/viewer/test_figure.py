@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.patches import Rectangle
 
-from schemas.reasons import Reason
+from schemas.reasons import REASON_TEXTS, Reason
 from services.common.errors import InputError
 from services.common.language import ENGLISH
 from services.viewer.crossing_view import (
@@ -151,6 +151,38 @@ def test_rejected_crossing_shows_its_reason_and_no_number() -> None:
     advice = ENGLISH.advice[Reason.CHANNEL_MISSING]
     assert any(advice[:60] in text for text in written)
     assert not any(text.startswith("$EI") for text in written)
+
+
+def test_explanation_of_a_rejection_hides_no_truth() -> None:
+    why = [Reason.MODEL_MISFIT, Reason.NOT_CONVERGED, Reason.IMPLAUSIBLE_VEHICLE]
+    rejected = view(
+        verdict="rejected",
+        reasons=tuple(why),
+        reason_texts=tuple(REASON_TEXTS[one] for one in why),
+        rigidity_nm2=None,
+        interval_nm2=None,
+        road=None,
+    )
+    figure = draw(rejected)
+    assert_words_apart(figure)
+    written = " ".join(" ".join(text.get_text() for text in words(figure)).split())
+    for one in why:
+        assert f"• {REASON_TEXTS[one]}" in written
+        assert f"• {ENGLISH.advice[one]}" in written
+    rigidity, profiles = figure.axes[:2]
+    truths = [line for axes in (rigidity, profiles) for line in axes.lines]
+    truths = [line for line in truths if line.get_label() == "truth"]
+    assert len(truths) == 2
+    for line in truths:
+        points = line.get_transform().transform(line.get_xydata())
+        for text in words(figure):
+            box = text.get_window_extent().padded(5.0)
+            assert not any(box.contains(x, y) for x, y in points), text.get_text()
+    for axes in (rigidity, profiles):
+        panel = axes.get_window_extent()
+        assert not any(panel.overlaps(text.get_window_extent()) for text in axes.texts)
+    assert profiles.get_title("left") == "Road profile (none was estimated)"
+    assert len(profiles.get_yticks()) > 2  # heights of the truth
 
 
 def test_differences_are_between_wheels_and_from_the_truth_where_it_is_known() -> None:
