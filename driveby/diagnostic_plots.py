@@ -14,7 +14,7 @@ from services.common.errors import InputError
 from services.notebook.arguments import names_of
 from services.notebook.inference import prior_density, prior_draws
 from services.notebook.simulate import Simulation, check_truth
-from services.notebook.solution import Identification, Solution, one_solution
+from services.notebook.solution import WITH_DRAWS, Identification, Solution, one_solution
 from services.viewer.drawing import MUTED, STYLE, mark_bridge, simplify_axes
 from services.viewer.residual_size import TREND_DEGREE, expected_reach_m
 
@@ -229,9 +229,7 @@ def _shown_unit(value: float, unit: str) -> tuple[float, str]:
 def _chosen(solution: Solution, names: Sequence[str] | None) -> list[str]:
     known = [name for name in solution.draws if name in solution.value]
     if not known:
-        raise InputError(
-            f"{solution.crossing.crossing_id}: has no draws; method pre has, with draws=True"
-        )
+        raise InputError(f"{solution.crossing.crossing_id}: has no draws; {WITH_DRAWS}")
     chosen = [name for name in known if name.startswith("EI_")]
     if names is not None:
         chosen = names_of("names", names)

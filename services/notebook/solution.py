@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 _STATISTICS = ("mean", "std", "q025", "q50", "q975")
 _SPREAD = ("std", "q025", "q975")
+WITH_DRAWS = "method pre has, with identify(..., draws=True), of crossings that are not rejected"
+"""The origin of draws, for errors where there are none."""
 
 
 @with_field_docs
@@ -189,7 +191,7 @@ def _with_draws(solutions: Sequence[Solution], place: str = "") -> list[Solution
     """Return the solutions with draws; raise InputError if there are none."""
     some = [solution for solution in solutions if solution.draws]
     if not some:
-        raise InputError(f"{place}no crossing has draws; method pre has, with draws=True")
+        raise InputError(f"{place}no crossing has draws; {WITH_DRAWS}")
     return some
 
 

@@ -364,6 +364,12 @@ def test_draws_may_be_forgotten(
     assert forgetful.solutions[0].draws == {}
     with pytest.raises(driveby.InputError, match="no crossing has draws"):
         forgetful.to_netcdf(tmp_path / "draws.npz")
+    needing = (driveby.plot_posterior, driveby.plot_chains, driveby.Identification.posterior)
+    for function in needing:
+        with pytest.raises(
+            driveby.InputError, match=r"method pre has, with identify\(\.\.\., draws=T"
+        ):
+            function(forgetful)
 
 
 def test_every_method_gives_the_same_type(
