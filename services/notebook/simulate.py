@@ -1,5 +1,6 @@
 """Simulation of a crossing in memory, with its truth, as by `driveby simulate`."""
 
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -15,6 +16,7 @@ from services.drives.runs import run_to_messages
 from services.drives.signals import Signals, signals_of_run
 from services.execution.blas import one_blas_thread
 from services.finding.placed import middle_site
+from services.identification.identify import SLOWEST_M_PER_S
 from services.notebook.arguments import (
     file_of,
     known_arguments,
@@ -46,7 +48,14 @@ from services.simulation.schedule import begun_at, schedule_of
 
 _REALM: Final = "sim-drive"
 _SCENARIOS: Final = 12
+_TOO_SLOW: Final = (
+    f"speed is {{:g}} m/s on average: identify() rejects crossings below {SLOWEST_M_PER_S:g} m/s"
+)
 _RATIOS: Final = "a ratio for each element, such as [1, 1, 0.4]"
+_NO_TRUTH: Final = (
+    "give either scenario= or ei=, such as scenario=6 or ei=[1, 1, 1, 0.4, 1, 1, 1], a ratio for "
+    "each element"
+)
 
 
 @with_field_docs
@@ -82,7 +91,9 @@ class Simulation(NamedTuple):
     def road_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """True profile under the tyres: chainage and height (m,), both in m.
 
-        It is the mean of the given road over a tyre's contact length, so its short waves are lower.
+        It covers the truck's way, which is mirrored for a drive from end to start: at 10 m/s from
+        66 m before the bridge to 35 m beyond it. It is the mean of the given road over a tyre's
+        contact length, so its short waves are lower.
         """
         return self.drive.road.x_m, self.drive.road.height_m
 
@@ -141,8 +152,9 @@ def simulate(
     or a profile under both axles: chainages from the start of the bridge and heights (n,) in m,
     level beyond its ends; `seed` draws road, noise and receiver errors. `noise` is the
     accelerometers' noise density in µg/√Hz, by default that of a given site, else 0; method pre
-    needs some. `speed` is in m/s, or a pair (start, end); `rate` in Hz is by default the site's.
-    BLAS is limited to one thread meanwhile.
+    needs some. `speed` is in m/s, or a pair (start, end); below 3 m/s, where identification rejects
+    a crossing, it brings a warning. `rate` in Hz is by default the site's. BLAS is limited to one
+    thread meanwhile.
 
     All drives begin at one time; crossings to be fused need others: `Simulation.started_at`.
 
@@ -150,12 +162,14 @@ def simulate(
     converge.
     """
     if (scenario is None) == (ei is None):
-        raise InputError("give either scenario= or ei=")
+        raise InputError(_NO_TRUTH)
     if direction not in ("start_to_end", "end_to_start"):
         raise InputError(f'direction is "{direction}", start_to_end or end_to_start expected')
     number_of = None if scenario is None else whole("scenario", scenario, 1, _SCENARIOS)
     ratios = None if ei is None else numbers("ei", ei, 1e-3, 1e3, _RATIOS)
     speeds = one_or_two("speed", speed, 0.1, 60, "(start, end)")
+    if sum(speeds) / 2.0 < SLOWEST_M_PER_S:
+        warnings.warn(_TOO_SLOW.format(sum(speeds) / 2.0), stacklevel=3)
     known = paper_site() if site is None else middle_site(given_site(site))
     asked = None if noise is None else number("noise", noise, 0, 1e6)
     density = noise_density_of(None if site is None else known, asked)

@@ -487,6 +487,28 @@ def test_arrays_and_lists_stand_for_numbers_as_tuples_do(
     assert asked.pop()[1:] == (1, (12.0, 12.0))
 
 
+@pytest.mark.parametrize("speed", [2.5, (2.0, 3.0)])
+def test_simulation_too_slow_to_be_identified_brings_a_warning(
+    speed: float | tuple[float, float], scenario_6: SimulatedDrive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(simulating, "simulate_drive", lambda *_, **__: scenario_6)
+    words = r"speed is 2\.5 m/s on average: identify\(\) rejects crossings below 3 m/s"
+    with pytest.warns(UserWarning, match=words) as warned:
+        driveby.simulate(scenario=6, speed=speed)
+    assert [one.filename for one in warned] == [__file__]
+    driveby.simulate(scenario=6, speed=3.0)  # a warning would be an error
+
+
+def test_true_profile_of_the_opposite_direction_has_the_mirrored_range(
+    simulation: driveby.Simulation,
+) -> None:
+    """As docs/python.md states for a given profile, which must reach as far."""
+    opposite = driveby.simulate(scenario=6, direction="end_to_start")
+    forward_m, backward_m = (one.road_m[0] for one in (simulation, opposite))
+    assert (forward_m[0], forward_m[-1] - 30.0) == pytest.approx((-66.0, 35.0), abs=0.5)
+    assert (backward_m[-1] - 30.0, -backward_m[0]) == pytest.approx((66.0, 35.0), abs=0.5)
+
+
 def test_simulate_is_exact_by_default(
     scenario_6: SimulatedDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -616,6 +638,7 @@ ROAD = "it must be a class from A to E or a pair of arrays (x_m, height_m)"
         (lambda: driveby.identify("x", seed=-1), "seed is -1"),
         (lambda: driveby.simulate(), "give either scenario= or ei="),
         (lambda: driveby.simulate(scenario=6, ei=[1.0]), "give either scenario= or ei="),
+        (lambda: driveby.simulate(), "such as scenario=6 or ei=[1, 1, 1, 0.4, 1, 1, 1]"),
         (
             lambda: driveby.simulate(scenario=13),
             "scenario is 13, it must be a whole number from 1 to 12",
