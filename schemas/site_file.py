@@ -59,12 +59,18 @@ def with_values(site: Site, values: Mapping[str, object]) -> Site:
     """Return the site with values replaced, by names such as `bridge.mass_per_length_kg_per_m`.
 
     Nominal values and spreads are the priors of the parameters. Where the site has several vehicles
-    or bridges, the identifier takes the place of the table's name. None restores a default. Raise
-    InputError in one line for a name or value that a site file must not have.
+    or bridges, the identifier takes the place of the table's name. None removes a key, so that its
+    default applies; a key without a default is missing then. Raise InputError in one line for a
+    name or value that a site file must not have.
     """
     if not isinstance(site, Site):
         raise InputError(
             f"site is of type {type(site).__name__}, it must be what load_site() returns"
+        )
+    if not isinstance(values, Mapping):
+        raise InputError(
+            f"values is of type {type(values).__name__}, it must be values by their names, such as "
+            '{"bridge.span_m": 20.0}'
         )
     tables = parse_toml(site_toml(site), "the site")
     by_name: dict[str, list[tuple[str, dict[str, Any]]]] = {}
@@ -73,7 +79,7 @@ def with_values(site: Site, values: Mapping[str, object]) -> Site:
             for name in dict.fromkeys((kind, table.get("id", kind))):
                 by_name.setdefault(name, []).append((kind, table))
     for name, value in values.items():
-        of, _, key = name.rpartition(".")
+        of, _, key = str(name).rpartition(".")
         possible = by_name.get(of, [])
         if len(possible) != 1:
             known = ", ".join(one for one, found in by_name.items() if len(found) == 1)

@@ -677,6 +677,18 @@ ROAD = "it must be a class from A to E or a pair of arrays (x_m, height_m)"
         (lambda: driveby.read(["a.mcap"]), "source is ['a.mcap'], it must be a recording"),
         (lambda: driveby.load_site(3), "site is of type int, it must be the name of a site file"),
         (lambda: driveby.with_values("a", {}), "site is of type str, it must be what load_site()"),
+        (
+            lambda: driveby.with_values(paper_site(), None),
+            "values is of type NoneType, it must be values by their names, such as {",
+        ),
+        (
+            lambda: driveby.with_values(paper_site(), {3: 4.0}),
+            "3: is unknown, it must be TABLE.KEY",
+        ),
+        (
+            lambda: driveby.with_values(paper_site(), {"bridge.span_m": None}),
+            "the site: bridge.span_m is missing",
+        ),
         (lambda: driveby.survey(paper_site(), crossings=2.5), "crossings is 2.5, it must be a"),
         (lambda: driveby.survey(paper_site(), speed="9"), 'speed is "9", it must be a number'),
         (lambda: driveby.survey(paper_site(), speed=[11, 9]), "speed is 9, it must be from 11"),
