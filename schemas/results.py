@@ -297,6 +297,7 @@ class Results(StrictModel):
     program: str = "driveby"
     version: str
     created: Finite
+    """Time at which the computation started, s since 1970 UTC."""
     site_hash: str
     settings: dict[str, JsonValue]
     seed: Annotated[int, Field(ge=0, lt=1 << 64)]

@@ -85,6 +85,7 @@ def fuse_crossings(
     one does not fit, or if no crossing can be fused; `name` is the place that such an error begins
     with.
     """
+    created_s = time.time()  # as identification does, before the work
     baselines = {} if stored is None else stored[1]
     fusing = FusionSettings(baselines, fuse_suspect, IdentificationSettings().threads)
     elements_of = {bridge: _elements(bridge, of) for bridge, of in found.by_bridge.items()}
@@ -107,7 +108,7 @@ def fuse_crossings(
     if not states:
         raise InputError(f"{name}: no crossing that could be fused; identify with method pre")
     last = found.last
-    header = ResultHeader(program_version(), time.time(), last.site_hash, last.settings, last.seed)
+    header = ResultHeader(program_version(), created_s, last.site_hash, last.settings, last.seed)
     every = results(header, with_common_shares(list(found.crossings), states), states)
     return FusedResults(every, bridges, unfused, found.repeated)
 

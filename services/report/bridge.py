@@ -69,7 +69,7 @@ class BridgeReport(NamedTuple):
     """Names of the results files."""
     programs: tuple[str, ...]
     computed_s: float
-    """Time at which the newest results were computed, s since 1970 UTC."""
+    """Time at which the computation of the newest results started, s since 1970 UTC."""
     site: Site
     before: Before | None
     finding: BridgeFinding

@@ -90,7 +90,10 @@ def _what_measured(report: BridgeReport, language: Language) -> Html:
         (language.text("fact.sensors"), sensors),
         (language.text("fact.road"), _newest_road(report.crossings, language)),
         (language.text("fact.source"), f"{files}; {programs}"),
-        (language.text("fact.computed"), f"{utc_second(report.computed_s)} UTC"),
+        (
+            language.text("fact.computed"),
+            language.text("fact.computed_at", time=utc_second(report.computed_s)),
+        ),
     ]
     return facts([row for row in rows if row[1]])
 

@@ -1,7 +1,9 @@
 """What `driveby fuse` says beside its table."""
 
 import json
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -9,6 +11,7 @@ import driveby
 from schemas.results import load_results
 from schemas.site_file import site_toml
 from services.cli.main import main
+from services.execution import fuse_results
 from services.history.validation_files import save
 from services.simulation.drive import paper_site
 from tests.builders.certificates import certificate
@@ -203,3 +206,21 @@ def test_folder_of_validation_records_and_site_file_must_exist(
     for option in ("--validations", "--site"):
         assert main(["fuse", str(path), option, str(tmp_path / "none")]) == 2
         assert str(tmp_path / "none") in capsys.readouterr().err
+
+
+def test_fused_results_are_dated_by_the_start_of_fusing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As identified ones are: reports call it the start."""
+    began_s: list[float] = []
+    fuse_bridge = fuse_results._state
+
+    def watched(*given: Any) -> Any:
+        began_s.append(time.time())
+        return fuse_bridge(*given)
+
+    monkeypatch.setattr(fuse_results, "_state", watched)
+    path = write(tmp_path / "r.json", [crossing(n) for n in range(2)])
+    before_s = time.time()
+    fused = driveby.fuse(path)
+    assert before_s <= fused.results.created <= began_s[0]

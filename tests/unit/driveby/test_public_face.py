@@ -906,7 +906,7 @@ def test_report_of_a_fused_bridge_has_its_numbers(
 ) -> None:
     of_fused = driveby.report(driveby.fuse(found), output=tmp_path / "fused.html").read_text()
     of_found = driveby.report(found, output=tmp_path / "found.html").read_text()
-    time = re.compile(r"[\d-]+ [\d:]+ UTC(?=</td>)")
+    time = re.compile(r"[\d-]+ [\d:]+ UTC(?= \(start\)</td>)")
     named = of_fused.replace(">fusion; ", ">identification; ")
     assert time.sub("", named) == time.sub("", of_found)
     given = driveby.report(found, site=found.site, output=tmp_path / "site.html")

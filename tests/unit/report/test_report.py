@@ -107,6 +107,7 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     assert "truck-1: 9.5 t, wheelbase 4.4 m, axle loads" in text
     assert "front and rear on body and axles" in text
     assert "Computed 2026-09-21 " in text
+    assert "UTC (start)" in text
 
 
 def test_measures_name_the_criterion_of_weighted_draws(site: Site) -> None:
