@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from schemas.reasons import LEFT_OUT_TEXTS, BridgeReason
-from schemas.results import BridgeResult, ElementState, Parameter, Thirds, ThirdsState, Track
+from schemas.results import (
+    BridgeResult,
+    CrossingResult,
+    ElementState,
+    Parameter,
+    Thirds,
+    ThirdsState,
+    Track,
+)
 from services.common.language import ENGLISH
 from services.common.naming import count_of, entry_in_name
 from services.identification.bridge_state import compared
@@ -50,8 +58,16 @@ class BridgeElements(Protocol):
         """Nominal rigidities of its elements, N·m²."""
 
 
-def print_bridge(console: "Console", bridge: BridgeElements, state: BridgeResult) -> None:
-    """Print the fused state of a bridge: first the quality of the measurement, then the bridge."""
+def print_bridge(
+    console: "Console",
+    bridge: BridgeElements,
+    state: BridgeResult,
+    crossings: Sequence[CrossingResult] = (),
+) -> None:
+    """Print the fused state of a bridge: first the quality of the measurement, then the bridge.
+
+    With all its `crossings` the runs of each wheel-path group are counted, not estimated.
+    """
     used, left = len(state.crossings_used), state.crossings_left_out_count
     console.print(
         f"[bold]{bridge.id}[/], {count_of(used, 'crossing')} together"
@@ -74,7 +90,7 @@ def print_bridge(console: "Console", bridge: BridgeElements, state: BridgeResult
         print_finding(console, bridge, state)
         if state.probability_of_loss is None and len(_days(state)) > 1:
             console.print(_NO_CHANGE, highlight=False)
-    for line in _of_state(state):
+    for line in _of_state(state, crossings):
         console.print(line, highlight=False)
 
 
@@ -132,7 +148,7 @@ def states_level(state: BridgeResult) -> bool:
     return describe_level(state.level) in state.finding
 
 
-def _of_state(state: BridgeResult) -> Iterator[str]:
+def _of_state(state: BridgeResult, crossings: Sequence[CrossingResult]) -> Iterator[str]:
     if state.level is not None and state.thirds is not None:
         yield from level_lines(state.level, state.thirds, is_stated=states_level(state))
     if state.between_crossing_std is not None and len(state.crossings_used) == 1:
@@ -147,7 +163,9 @@ def _of_state(state: BridgeResult) -> Iterator[str]:
             f"{100.0 * (low or 0.0):.1f} to {100.0 * (high or 0.0):.1f} %"
         )
     for track in state.tracks:
-        wander = "" if track.wander_m is None else f", lateral wander {_wander(state, track)}"
+        wander = ""
+        if track.wander_m is not None:
+            wander = f", lateral wander {_wander(track.wander_m, *_runs(state, track, crossings))}"
         yield (
             f"wheel-path group of {track.vehicle}, {track.direction.replace('_', ' ')}{wander}: "
             f"{100.0 * track.common_share:.0f} % of the profile mismatch is common to all runs, "
@@ -155,16 +173,36 @@ def _of_state(state: BridgeResult) -> Iterator[str]:
         )
 
 
-def _wander(state: BridgeResult, track: Track) -> str:
+def _wander(wander_m: float, runs: float, is_exact: bool) -> str:
     """Return the lateral wander of a group, with a caveat if its runs are few.
 
     A standard deviation of n runs has a relative error of 1/√(2(n − 1)), 35 % for five.
     """
-    runs = len(state.crossings_used) / len(state.tracks)
     if runs >= _ENOUGH_RUNS:
-        return f"{track.wander_m:.2f} m"
-    few = f"poorly known from about {count_of(round(runs), 'run')}, partly a usual value"
-    return f"{track.wander_m:.2f} m ({few})"
+        return f"{wander_m:.2f} m"
+    number = f"{'' if is_exact else 'about '}{count_of(round(runs), 'run')}"
+    return f"{wander_m:.2f} m (poorly known from {number}, partly a usual value)"
+
+
+def _runs(
+    state: BridgeResult, track: Track, crossings: Sequence[CrossingResult]
+) -> tuple[float, bool]:
+    """Return the number of runs of a wheel-path group, and whether it is exact.
+
+    A state does not have it, nor groups of a single run. Without the crossings it is the mean of
+    the groups of the truck, which stands in the names of crossings.
+    """
+    group = (track.vehicle, track.direction)
+    group_of = {one.crossing_id: (one.vehicle, one.direction) for one in crossings}
+    # A group with other stretches of road has the same truck and direction.
+    alike = [one for one in state.tracks if (one.vehicle, one.direction) == group]
+    if group_of.keys() >= set(state.crossings_used):
+        runs = sum(group_of[name] == group for name in state.crossings_used)
+        return runs / len(alike), len(alike) == 1
+    of_truck = [name for name in state.crossings_used if name.startswith(f"{track.vehicle}.")]
+    if not of_truck:  # names of older programs
+        return len(state.crossings_used) / len(state.tracks), False
+    return len(of_truck) / sum(one.vehicle == track.vehicle for one in state.tracks), False
 
 
 def print_elements(

@@ -60,7 +60,7 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
     for number, (name, elements) in enumerate(fused.bridges.items()):
         if number > 0:
             console.print()
-        print_bridge(console, elements, fused.results.bridges[name])
+        print_bridge(console, elements, fused.results.bridges[name], fused.results.crossings)
     newest, _ = max(zip(paths, files, strict=True), key=lambda one: one[1].created)
     _print_validations(console, newest, fused.results, asked)
     if stored is not None:

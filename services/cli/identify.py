@@ -278,7 +278,7 @@ def _print(console: "Console", found: Results, site: Site) -> None:
     for name, state in found.bridges.items():
         if name not in alone:
             console.print()
-            print_bridge(console, site.bridge(name), state)
+            print_bridge(console, site.bridge(name), state, found.crossings)
         elif state.between_crossing_std is not None:
             console.print(_as_state(site.bridge(name), state), highlight=False)
             print_finding(console, site.bridge(name), state)
