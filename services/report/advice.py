@@ -48,7 +48,8 @@ def next_steps(report: BridgeReport, language: Language) -> Iterator[str]:
             yield language.text("advice.check")
             yield language.text("advice.twice")
             return
-    if not report.is_validated:
+    # A weak element is inspected in any case.
+    if report.finding.kind != "weak" and not report.is_validated:
         yield language.text("advice.validate")
     comparison = report.view.comparison
     if report.before is not None:

@@ -967,3 +967,14 @@ def test_quality_states_simulation_and_passed_site_validation(site: Site, tmp_pa
     save(tmp_path, certificate(site, passed=False))
     (report,) = bridge_reports([(Path("x.json"), found, site)], None, validations=tmp_path)
     assert "passed" not in report.quality
+
+
+@pytest.mark.parametrize("is_weak", [False, True])
+def test_validation_is_a_next_step_where_the_finding_relies_on_intervals(
+    site: Site, is_weak: bool
+) -> None:
+    results = fused(site, KNOWN) if is_weak else without_weak(site, KNOWN)
+    (report,) = bridge_reports([(Path("x.json"), results, site)], None)
+    step = ENGLISH.text("advice.validate")
+    assert (step in next_steps(report, ENGLISH)) != is_weak
+    assert step not in next_steps(report._replace(is_validated=True), ENGLISH)
