@@ -90,7 +90,7 @@ class Finder:
         self.unknown_vehicles.clear()
 
     def leave_to_recordings(self, until_ns: Mapping[str, int]) -> None:
-        """Exclude crossings of recorded trucks whose data begin or end too early here.
+        """Exclude crossings of recorded trucks whose data begin or end too early, or lack a part.
 
         `until_ns` is the wall time, by truck, up to which a logger has recorded it: in ns since
         1970 UTC. Such a crossing is complete in the recording.
@@ -203,6 +203,8 @@ class Finder:
             return False
         if bridge not in self.scene.bridges.number:
             return True  # it belongs to another site file
+        if truck.has_left(bridge, entry_s):
+            return False
         before = LONGEST_MARGIN_S if vehicle in self._recorded else 0.0
         return not truck.boot.is_cut_off_at(entry_s - before)
 
@@ -268,9 +270,11 @@ class Finder:
                 stay = stay._replace(passage=Passage.TURNED_BACK)
             elif wait(truck, window, stay, now_s):
                 return
-        is_behind = stay.is_over and truck.boot.latest_accel_s() < stay.exit_s
-        if is_behind and self._is_recorded(truck, stay):
-            return  # the connection broke between positions and accelerations
+        # The connection broke between positions and accelerations, or damaged a message.
+        has_hole = stay.is_over and truck.has_hole(window, stay, now_s)
+        if has_hole and self._is_recorded(truck, stay):
+            truck.left.add(crossing_id)
+            return
         truck.decide(bridge.id, stay, crossing_id)
         detection = _detection(truck, bridge, found, crossing_id)
         yield Complete(detection, self.scene.data(truck, detection, stay, window))

@@ -54,6 +54,8 @@ class TruckBoot:
         self.done: set[str] = set()
         self.decided: list[tuple[str, float, float, str]] = []
         """Bridge, times of the fixes around it, and id of each decided crossing."""
+        self.left: set[str] = set()
+        """Detected crossings that are left to the recordings."""
         self.place: tuple[float, float, float] | None = None
         """Time, latitude and longitude of the latest fix."""
         self.near: dict[int, Visit] = {}
@@ -90,8 +92,9 @@ class TruckBoot:
             self.ingest_info(self._declared_toml)
 
     def busy_at(self) -> set[str]:
-        """Return the bridges with a crossing that has started and is not decided."""
-        return {bridge for (bridge, _), name in self.detected.items() if name not in self.done}
+        """Return the bridges with a crossing that has started and is to be decided here."""
+        over = self.done | self.left
+        return {bridge for (bridge, _), name in self.detected.items() if name not in over}
 
     def add_fix(self, bridges: Bridges, fix: GnssFix) -> list[int]:
         """Add a fix; return the numbers of the bridges whose stays it may change."""
@@ -163,6 +166,13 @@ class TruckBoot:
         self.done.add(crossing_id)
         self.decided.append((bridge, *around, crossing_id))
 
+    def has_left(self, bridge: str, entry_s: float) -> bool:
+        """Return whether a crossing with entry at about `entry_s` is left to the recordings."""
+        return any(
+            known == bridge and abs(at_s - entry_s) < MERGE_S and crossing_id in self.left
+            for (known, at_s), crossing_id in self.detected.items()
+        )
+
     def may_still_come(self, window: Window, stay: Stay, now_s: float) -> bool:
         """Return whether a crossing lacks data that may still arrive soon."""
         begin_s, end_s = window
@@ -220,7 +230,10 @@ class TruckBoot:
         self.detected = {
             (bridge, entry_s): crossing_id
             for (bridge, entry_s), crossing_id in self.detected.items()
-            if entry_s >= time_s - MERGE_S or crossing_id in kept or crossing_id not in self.done
+            if entry_s >= time_s - MERGE_S
+            or crossing_id in kept
+            or crossing_id not in self.done | self.left
         }
+        self.left &= set(self.detected.values())
         kept.update(self.detected.values())
         self.done &= kept

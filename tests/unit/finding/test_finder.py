@@ -62,6 +62,15 @@ def test_a_stay_that_is_decided_elsewhere_is_not_found_again() -> None:
 ALWAYS_NS = 1 << 62
 
 
+def batch_on_bridge() -> Message:
+    """Return the accelerations of a time at which the truck is on the bridge for the first time."""
+    (first, *_) = (one for one in found(Finder(SITE, wide_window)) if isinstance(one, Detection))
+    middle_ns = (first.entry_ns + first.exit_ns) // 2
+    return min(
+        (m for m in TWO if m.key.stream == "accel"), key=lambda m: abs(m.log_time_ns - middle_ns)
+    )
+
+
 def complete(finder: Finder, messages: Iterable[Message]) -> list[Complete]:
     events = [one for m in messages for one in finder.feed(m.key, m.payload)]
     return [one for one in (*events, *finder.finish()) if isinstance(one, Complete)]
@@ -88,3 +97,39 @@ def test_positions_that_came_alone_are_left_to_a_recording(
     finder = Finder(SITE, wide_window)
     finder.leave_to_recordings(until_ns)
     assert len(complete(finder, [m for m in TWO if m.key.stream != "accel"])) == crossings
+
+
+@pytest.mark.parametrize(
+    ("until_ns", "crossings"), [({}, 2), ({"truck-1": ALWAYS_NS}, 1), ({"truck-1": 0}, 2)]
+)
+def test_a_crossing_with_a_hole_is_left_to_a_recording(
+    until_ns: dict[str, int], crossings: int
+) -> None:
+    """A message may be damaged on the bus, and whole in the recording."""
+    finder = Finder(SITE, wide_window)
+    finder.leave_to_recordings(until_ns)
+    lost = batch_on_bridge()
+    assert len(complete(finder, [m for m in TWO if m is not lost])) == crossings
+    assert not finder.has_undecided(TWO[0].key.realm, TWO[0].key.identifier)
+
+
+@pytest.mark.parametrize("is_late", [False, True])
+def test_what_is_left_to_a_recording_is_not_tracked(*, is_late: bool) -> None:
+    """Unless what was missing comes in time."""
+    finder = Finder(SITE, wide_window)
+    finder.leave_to_recordings({"truck-1": ALWAYS_NS})
+    lost = batch_on_bridge()
+    messages = [m for m in TWO if m is not lost]
+    if is_late:
+        messages.insert(messages.index(TWO[TWO.index(lost) + 40]), lost)
+    events = [one for m in messages for one in finder.feed(m.key, m.payload)]
+    first = next(one for one in events if isinstance(one, Detection))
+    key = TWO[0].key
+    assert (
+        finder.is_tracking(
+            *(key.realm, key.identifier, TWO[0].boot_id, first.bridge, first.stay.entry_s)
+        )
+        == is_late
+    )
+    decided = [one for one in events if isinstance(one, Complete)]
+    assert any(one.detection.crossing_id == first.crossing_id for one in decided) == is_late
