@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from pre_core.arrays import FloatArray
 from pre_core.crossing.comparison import is_better
 from pre_core.crossing.fit import (
     HOPELESS_CHI2,
@@ -9,6 +10,7 @@ from pre_core.crossing.fit import (
     SearchStrategy,
     complete_fit,
     fit_all,
+    is_accepted,
 )
 from pre_core.crossing.frequency_continuation import (
     ENOUGH,
@@ -36,6 +38,52 @@ def refined(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> t
     if _is_sharp(found):
         return _with_other_bridge(found, strategy, max_evaluations)
     return _refine_offset(found, strategy, max_evaluations)
+
+
+def about_truck(
+    found: Optimum, y: FloatArray, strategy: SearchStrategy, max_evaluations: int
+) -> tuple[Optimum | None, int]:
+    """Return the best optimum of bridges about a truck at y (size,), and the evaluations.
+
+    The truck explains the residuals off the bridge, where no bridge acts, so a misfit may be due to
+    a bridge that vibrates at another frequency. Bridges of other frequencies are tried about this
+    truck, and about each better optimum; None if the first ones fit no better than `found`.
+    """
+    best, around, evaluations = None, found._replace(state=found.state._replace(y=y)), 0
+    chi2, is_even = found.chi2_per_dof, True
+    while evaluations <= max_evaluations:
+        others, used = other_bridges(around, strategy, is_even=is_even)
+        better, used_by_fits = _best_fit(around, others, strategy)
+        evaluations += used + used_by_fits
+        if better is None or better.chi2_per_dof >= chi2:
+            break
+        best = around = better
+        chi2, is_even = better.chi2_per_dof, not is_even
+        if is_accepted(better.problem, chi2):
+            break
+    return best, evaluations
+
+
+def _best_fit(
+    around: Optimum, others: list[OtherBridge], strategy: SearchStrategy
+) -> tuple[Optimum | None, int]:
+    """Return the best fit of all parameters from the likeliest other bridges, and evaluations."""
+    best: Optimum | None = None
+    evaluations = 0
+    for other in [one for one in others if one.gain > ENOUGH][:_TRIED_BRIDGES]:
+        fitted, used = fit_all(around.problem, other.y, strategy)
+        evaluations += used
+        if fitted is None:
+            continue
+        if fitted.chi2_per_dof <= HOPELESS_CHI2:
+            completed = complete_fit(fitted)
+            evaluations += completed.evaluations - fitted.evaluations
+            fitted = completed
+        if best is None or fitted.chi2_per_dof < best.chi2_per_dof:
+            best = fitted
+        if is_accepted(best.problem, best.chi2_per_dof):
+            break
+    return best, evaluations
 
 
 def _is_sharp(found: Optimum) -> bool:

@@ -312,8 +312,8 @@ def test_other_trucks_are_tried_only_where_the_first_fails_off_the_bridge(
     alone = OffBridgeFit(np.zeros(1), off_bridge, 10)
     monkeypatch.setattr(optimum, "fit_off_bridge", lambda one: alone)
     monkeypatch.setattr(misfit, "levels_at", lambda problem, y: np.array([level]))
-    strategies, used = optimum._other_strategies(found(5.0, 1))
-    assert used == 10
+    strategies, fitted = optimum._other_strategies(found(5.0, 1))
+    assert fitted is alone
     full_weight, reduced_weight = optimum._WITHOUT_MISMATCH
     everything = (reduced_weight, *optimum.WITH_MISMATCH, full_weight)
     assert strategies == ((full_weight,) if tried == "full weight" else everything)
@@ -327,8 +327,9 @@ def test_clear_friction_and_mismatch_need_no_fit_off_the_bridge(
         raise AssertionError("the residuals off the bridge were fitted")
 
     monkeypatch.setattr(optimum, "fit_off_bridge", no_fit)
-    strategies, used = optimum._other_strategies(found(5.0, 1)._replace(**{clear: True}))
-    assert (len(strategies), used) == (4, 0)
+    strategies, alone = optimum._other_strategies(found(5.0, 1)._replace(**{clear: True}))
+    assert (len(strategies), alone.evaluations) == (4, 0)
+    assert not np.isfinite(alone.chi2)
 
 
 @pytest.mark.parametrize(
@@ -374,13 +375,81 @@ def test_without_a_fit_the_best_poor_start_is_completed(
     monkeypatch.setattr(optimum, "strongest_line_at_hz", lambda *_: 0.0)
     first, second = (found(value, 1)._replace(unfinished=STRATEGY) for value in chi2)
     monkeypatch.setattr(optimum, "_refine_candidates", lambda *_: first)
-    monkeypatch.setattr(optimum, "_other_strategies", lambda _: ((), 0))
+    monkeypatch.setattr(
+        optimum, "_other_strategies", lambda _: ((), OffBridgeFit(np.zeros(1), np.inf, 0))
+    )
     monkeypatch.setattr(optimum, "_try_strategies", lambda *_: [second])
     problem: Any = SimpleNamespace(crossing=SimpleNamespace(lead=NO_LEAD))
     ended = optimum._run_strategies(problem, np.zeros(1), lambda *_: None, 1000)
     assert len(ended) == 2
     assert min(one.chi2_per_dof for one in ended) == ends_at
     assert sum(one.evaluations for one in ended) == (102 if ends_at == 1.0 else 2)
+
+
+@pytest.mark.parametrize(
+    ("chi2", "best", "sets"),
+    [
+        # The first bridge about the truck is the right one.
+        ((1.0,), 1.0, 1),
+        # The second of the first set is better, and leads to another one.
+        ((6.0, 3.0, 1.0), 1.0, 2),
+        # None fits better than what was found before.
+        ((6.0, 5.0), None, 1),
+        # The second set leads no further.
+        ((3.0, 4.0, 3.0, 3.5), 3.0, 2),
+    ],
+)
+def test_other_bridges_about_a_truck_are_tried_as_long_as_they_fit_better(
+    chi2: tuple[float, ...], best: float | None, sets: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reached, about = iter(chi2), []
+
+    def others(one: Any, _: Any, *, is_even: bool) -> tuple[list[Any], int]:
+        about.append((one.state.y.tolist(), is_even))
+        return [SimpleNamespace(y=np.ones(1), gain=gain) for gain in (9.0, 8.0, 7.0, -1.0)], 10
+
+    monkeypatch.setattr(refinement, "other_bridges", others)
+    monkeypatch.setattr(refinement, "is_accepted", lambda _, value: value < 1.5)
+    monkeypatch.setattr(refinement, "complete_fit", lambda one: one)
+    monkeypatch.setattr(refinement, "fit_all", lambda *_: (found(next(reached), 1), 1))
+    first = found(5.0, 1)._replace(state=SimpleNamespace(y=np.zeros(1), _replace=moved))
+    other, used = refinement.about_truck(first, np.full(1, 7.0), STRATEGY, 1000)
+    assert (other.chi2_per_dof if other else None) == best
+    assert about == [([7.0], True), ([0.0], False)][:sets]
+    assert used == 10 * sets + len(chi2)
+    assert not list(reached)
+
+
+def moved(y: NDArray[np.float64]) -> Any:
+    """Return a stand-in for a state at y (size,)."""
+    return SimpleNamespace(y=y)
+
+
+@pytest.mark.parametrize(
+    ("chi2", "off_bridge", "force", "is_tried"),
+    [
+        (5.0, 1.0, 0.0, True),
+        (51.0, 1.0, 0.0, False),
+        (5.0, 1.6, 0.0, False),
+        (5.0, 1.0, 1.0, False),
+    ],
+)
+def test_other_bridges_are_tried_where_only_the_bridge_is_not_explained(
+    chi2: float,
+    off_bridge: float,
+    force: float,
+    is_tried: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(optimum, "is_accepted", lambda _, value: value < 1.5)
+    monkeypatch.setattr(optimum, "strongest_line_at_hz", lambda *_: 0.0)
+    monkeypatch.setattr(misfit, "levels_at", lambda problem, y: np.zeros(1))
+    monkeypatch.setattr(optimum, "about_truck", lambda *_: (found(1.0, 1), 30))
+    one = found(chi2, 4)
+    one.problem.force = np.array([force])
+    alone = OffBridgeFit(np.zeros(1), off_bridge, 10)
+    tried = optimum._about_truck([one], alone, lambda *_: None, 1000)
+    assert [(other.chi2_per_dof, other.evaluations) for other in tried] == [(1.0, 30)] * is_tried
 
 
 def completed(one: Optimum) -> Optimum:
