@@ -74,6 +74,9 @@ NOT_RUN = {
     'pip install -e ".[opensees]"': NETWORK,
     "python -m tests.benchmarks.cluster_scale --crossings 2000": LONG,
     "python -m studies.scripts.local_minima": LONG,
+    "python -m studies.scripts.local_minima --site studies/scripts/lorry_24_m.toml "
+    "--crossings 25": LONG,
+    "driveby validate --site studies/scripts/lorry_24_m.toml": CERTIFIES,
     "make install": "installs what this test runs in; .ci/run begins with it",
     "make demo": "tests/process_replay/test_demo.py runs the command of the target",
     "make test": ITSELF,
