@@ -8,6 +8,7 @@ from schemas.results import CrossingResult
 from schemas.site import Site
 from services.catalogue.contents import RecordingSummary, TruckSummary
 from services.common.language import utc_second
+from services.common.naming import count_of
 from services.finding.bridges import DetectedCrossing
 from services.finding.placed import sensors_in_words
 from services.finding.stays import MERGE_S, Passage
@@ -111,7 +112,7 @@ def _sensors(truck: TruckSummary, site: Site | None) -> list[str]:
 def _state(found: RecordingSummary) -> str:
     cut = ", **being written or cut off**" if found.info.truncated else ""
     damaged = found.info.damaged_chunks
-    return f"{cut}, **{damaged} damaged places**" if damaged else cut
+    return f"{cut}, **{count_of(damaged, 'damaged place')}**" if damaged else cut
 
 
 def _moment(time_ns: int) -> str:

@@ -317,7 +317,8 @@ def _number_of_gaps(one: "RecordingSummary") -> int:
 
 
 def _state(one: "RecordingSummary") -> str:
-    damage = f", {one.info.damaged_chunks} damaged places" if one.info.damaged_chunks else ""
+    places = one.info.damaged_chunks
+    damage = f", {count_of(places, 'damaged place')}" if places else ""
     if one.info.truncated:
         return f"being written or cut off{damage}"
     return damage.removeprefix(", ") or "complete"
