@@ -266,9 +266,9 @@ def test_page_holds_every_aim_and_every_part() -> None:
         # What has a table of its own is listed only where it is missed.
         is_listed = check.name not in judged or not check.is_met
         assert (f"| {check.name.replace('|', chr(92) + '|')} |" in page) is is_listed
-    assert f"method version {METHOD_EDITION}" in page
+    assert f"of method version {METHOD_EDITION}." in " ".join(page.split())
     assert "40 crossings, seeds 0 to 39" in page
-    assert "0 of 5 are `good`, 5 of 5 have a reason for it" in " ".join(page.split())
+    assert "0 of 5 are `good`, 5 of 5 have a reason that names the misfit" in " ".join(page.split())
     assert "| 12 | EI_7 | 0.40 |" in page
     assert "d1_clean_const_speed 0 | good" in page
     assert "{" not in page
