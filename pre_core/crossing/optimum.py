@@ -81,7 +81,7 @@ _MAX_EVALUATIONS = 100_000
 beyond this a search has failed, and its numbers are not reliable."""
 _MAX_ABOUT_TRUCK = 20_000
 """Limit of evaluations for other bridges about a truck: of 25 drawn crossings of a plain bridge of
-24 m, four of which had ended at a wrong one, three took 4,000 to 17,000 to the right one."""
+24 m, six of which had ended at a wrong one, four took 4,000 to 17,000 to the right one."""
 _WRONG_BRIDGE_CHI2 = 50.0
 """Value of chi2 above which no other bridge is tried about a truck: where the search had ended at
 another frequency it was 1.5 to 25, with a vehicle following up to 1,900."""

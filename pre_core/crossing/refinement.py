@@ -21,6 +21,7 @@ from pre_core.crossing.frequency_continuation import (
 from pre_core.crossing.mismatch import has_alike_tyres
 from pre_core.crossing.posterior import has_tandem, layout
 from pre_core.crossing.walk import better_neighbour, shifted_to
+from pre_core.search.loop import Termination
 
 _CLEAR_RESTRAINT = 0.5
 """Size of restraints, bearing compliance or torsion, in scales of their priors, above which the
@@ -79,6 +80,12 @@ def _best_fit(
             completed = complete_fit(fitted)
             evaluations += completed.evaluations - fitted.evaluations
             fitted = completed
+        is_fit = is_accepted(fitted.problem, fitted.chi2_per_dof)
+        if is_fit and fitted.ending is not Termination.CONVERGED:
+            # A bridge far from the first one may need more steps than a fit takes.
+            again, used = fit_all(fitted.problem, fitted.state.y, strategy)
+            evaluations += used
+            fitted = fitted if again is None else again
         if best is None or fitted.chi2_per_dof < best.chi2_per_dof:
             best = fitted
         if is_accepted(best.problem, best.chi2_per_dof):

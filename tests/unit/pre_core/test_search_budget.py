@@ -420,6 +420,22 @@ def test_other_bridges_about_a_truck_are_tried_as_long_as_they_fit_better(
     assert not list(reached)
 
 
+def test_an_accepted_bridge_that_took_all_steps_is_fitted_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ends = iter((Termination.STEPS_EXHAUSTED, Termination.CONVERGED))
+    bridge = [SimpleNamespace(y=np.ones(1), gain=9.0)]
+    monkeypatch.setattr(refinement, "other_bridges", lambda *_, **__: (bridge, 10))
+    monkeypatch.setattr(refinement, "is_accepted", lambda _, value: value < 1.5)
+    monkeypatch.setattr(refinement, "complete_fit", lambda one: one)
+    monkeypatch.setattr(refinement, "fit_all", lambda *_: (found(1.0, 1, next(ends)), 1))
+    first = found(5.0, 1)._replace(state=SimpleNamespace(y=np.zeros(1), _replace=moved))
+    other, used = refinement.about_truck(first, np.zeros(1), STRATEGY, 1000)
+    assert other is not None
+    assert other.ending is Termination.CONVERGED
+    assert used == 12
+
+
 def moved(y: NDArray[np.float64]) -> Any:
     """Return a stand-in for a state at y (size,)."""
     return SimpleNamespace(y=y)
