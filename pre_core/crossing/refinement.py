@@ -71,15 +71,11 @@ def _best_fit(
     """Return the best fit of all parameters from the likeliest other bridges, and evaluations."""
     best: Optimum | None = None
     evaluations = 0
-    for other in [one for one in others if one.gain > ENOUGH][:_TRIED_BRIDGES]:
-        fitted, used = fit_all(around.problem, other.y, strategy)
+    for other in _likeliest(others):
+        fitted, used = _fitted(around, other, strategy, HOPELESS_CHI2)
         evaluations += used
         if fitted is None:
             continue
-        if fitted.chi2_per_dof <= HOPELESS_CHI2:
-            completed = complete_fit(fitted)
-            evaluations += completed.evaluations - fitted.evaluations
-            fitted = completed
         is_fit = is_accepted(fitted.problem, fitted.chi2_per_dof)
         if is_fit and fitted.ending is not Termination.CONVERGED:
             # A bridge far from the first one may need more steps than a fit takes.
@@ -91,6 +87,25 @@ def _best_fit(
         if is_accepted(best.problem, best.chi2_per_dof):
             break
     return best, evaluations
+
+
+def _likeliest(others: list[OtherBridge]) -> list[OtherBridge]:
+    """Return the bridges from which all parameters are fitted, best first as given."""
+    return [one for one in others if one.gain > ENOUGH][:_TRIED_BRIDGES]
+
+
+def _fitted(
+    around: Optimum, other: OtherBridge, strategy: SearchStrategy, completed_to: float = np.inf
+) -> tuple[Optimum | None, int]:
+    """Return the fit of all parameters from another bridge, if there is one, and evaluations.
+
+    It is completed up to a chi2 of `completed_to`.
+    """
+    fitted, used = fit_all(around.problem, other.y, strategy)
+    if fitted is None or fitted.chi2_per_dof > completed_to:
+        return fitted, used
+    completed = complete_fit(fitted)
+    return completed, used + completed.evaluations - fitted.evaluations
 
 
 def _is_sharp(found: Optimum) -> bool:
@@ -116,15 +131,11 @@ def _with_other_bridge(
         others, used = other_bridges(found, strategy, is_even=is_even)
         evaluations += used
         before = found
-        for other in [one for one in others if one.gain > ENOUGH][:_TRIED_BRIDGES]:
-            fitted, used = fit_all(found.problem, other.y, strategy)
+        for other in _likeliest(others):
+            fitted, used = _fitted(found, other, strategy)
             evaluations += used
-            if fitted is None:
-                continue
-            completed = complete_fit(fitted)
-            evaluations += completed.evaluations - fitted.evaluations
-            if is_better(completed, found):
-                found = completed
+            if fitted is not None and is_better(fitted, found):
+                found = fitted
                 break
         is_same = found is before
         failed, rivals = (failed + 1, [*rivals, *others]) if is_same else (0, [])
