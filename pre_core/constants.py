@@ -11,8 +11,11 @@ NORMAL_975 = 1.959963984540054
 """97.5 % quantile of the standard normal distribution: half the width of a 95 % interval in
 standard deviations."""
 
+DETECTION_PROBABILITY = 0.95
+"""Probability with which a loss must be found to be called detectable, in plans and findings."""
+
 NORMAL_95 = 1.6448536269514722
-"""95 % quantile of the standard normal distribution."""
+"""Quantile of the standard normal distribution for `DETECTION_PROBABILITY`."""
 
 SLOPE_SPREAD = 4e-3
 """Prior standard deviation of the part of d ln EI/dT that all elements of a bridge share, 1/K:

@@ -13,11 +13,11 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from pre_core.arrays import FloatArray
+from pre_core.constants import DETECTION_PROBABILITY
 from pre_core.survey.plan import BridgePrior
 
 FALSE_ALARM = 0.01
 """Probability of a false alarm for each tested element without a loss."""
-DETECTION_PROBABILITY = 0.95
 
 
 class DetectionErrors(NamedTuple):

@@ -22,6 +22,7 @@ from services.identification.bridge_state import compared
 from services.identification.comparison import (
     describe_level,
     describe_possibly_weak,
+    possibly_weak,
     unresolved_elements,
 )
 
@@ -113,11 +114,9 @@ def print_finding(console: "Console", bridge: BridgeElements, state: BridgeResul
     if state.probability_of_loss is not None:
         return
     nominal, lengths = map(np.array, (bridge.nominal_flexural_rigidity_nm2, bridge.lengths_m))
-    found = compared(state, nominal, lengths)
     unresolved = unresolved_elements(state.elements.values())
-    lower = () if found is None else found.lower
-    possibly = [one for one in lower if one.number not in unresolved]
-    for line in (*describe_possibly_weak(possibly), _NO_BASELINE):
+    lower = possibly_weak(compared(state, nominal, lengths), unresolved)
+    for line in (*describe_possibly_weak(lower), _NO_BASELINE):
         console.print(line, highlight=False)
 
 

@@ -19,8 +19,6 @@ from services.common.language import ENGLISH, Language
 
 CLEAR_LOSS = 0.1
 """Smallest stiffness loss that the whole 95 % interval of a weak element must exceed."""
-DETECTED = 0.95
-"""Probability with which a loss must be clear to be called detectable, as in survey plans."""
 IMPLAUSIBLE_GAIN = 0.2
 """Gain above which no whole 95 % interval of an element is plausible: from summer to winter,
 30 K, the stiffness of concrete and asphalt rises by some 12 %."""
@@ -81,7 +79,7 @@ class Element(NamedTuple):
 
     @property
     def detectable_loss(self) -> float:
-        """Smallest loss of this element that is clear with the probability `DETECTED`.
+        """Smallest loss of this element that is clear with the probability `DETECTION_PROBABILITY`.
 
         See `clear_loss_detectable`.
         """
@@ -89,7 +87,7 @@ class Element(NamedTuple):
 
 
 def clear_loss_detectable(half_width: Floats) -> Floats:
-    """Return the losses (n,) that are clear with the probability `DETECTED`.
+    """Return the losses (n,) that are clear with the probability `DETECTION_PROBABILITY`.
 
     `half_width` (n,) is 1.96 σ, with the standard deviation σ of ln EI relative to the reference.
     The upper end of the interval of a loss L is distributed about ln(1 - L) + 1.96 σ with the same
@@ -307,6 +305,12 @@ def describe_weak_before(weak: Sequence[Element], language: Language = ENGLISH) 
             for one in weak
         ]
         yield language.choice("caution.earlier", len(weak), elements=language.listed(listed))
+
+
+def possibly_weak(found: Comparison | None, unresolved: Set[int]) -> tuple[Element, ...]:
+    """Return the resolved elements whose interval excludes no loss, but not a small one."""
+    lower = () if found is None else found.lower
+    return tuple(element for element in lower if element.number not in unresolved)
 
 
 def describe_possibly_weak(

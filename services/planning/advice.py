@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from math import inf
 from typing import Final, NamedTuple
 
-from pre_core.survey.detection import DETECTION_PROBABILITY
+from pre_core.constants import DETECTION_PROBABILITY
 from services.common.naming import count_of
 from services.common.truck_choice import truck_to_try
 from services.identification.checks import SHORTEST_APPROACH_M

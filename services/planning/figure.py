@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from pre_core.survey.detection import DETECTION_PROBABILITY
+from pre_core.constants import DETECTION_PROBABILITY
 from services.common.arrays import Floats
 from services.planning.advice import tyres_of
 from services.planning.survey import SurveyForecast

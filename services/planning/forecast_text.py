@@ -4,7 +4,8 @@ from collections.abc import Iterator
 from itertools import accumulate
 from typing import Any
 
-from pre_core.survey.detection import DETECTION_PROBABILITY, FALSE_ALARM
+from pre_core.constants import DETECTION_PROBABILITY
+from pre_core.survey.detection import FALSE_ALARM
 from services.identification.comparison import CLEAR_LOSS
 from services.planning.advice import advice, mismatch_in_words, percent, tyres_of, warnings
 from services.planning.crossings import scale_error

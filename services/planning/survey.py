@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from pre_core.constants import NORMAL_975
+from pre_core.constants import DETECTION_PROBABILITY, NORMAL_975
 from pre_core.survey import detection
 from pre_core.survey.plan import (
     BridgePrior,
@@ -292,7 +292,7 @@ def _needed(
 
     def is_seen(crossings: int) -> bool:
         seen = detection.detection_probability(loss, errors_of(crossings).of_nominal)
-        return bool(seen[list(elements)].min() >= detection.DETECTION_PROBABILITY)
+        return bool(seen[list(elements)].min() >= DETECTION_PROBABILITY)
 
     if not is_seen(MAX_CROSSINGS):
         return None

@@ -26,6 +26,7 @@ from services.identification.comparison import (
     describe_possibly_weak,
     describe_weak_before,
 )
+from services.identification.comparison import possibly_weak as possibly_less_stiff
 from services.identification.comparison import weak_before as of_baseline
 from services.report.earlier import Before, CombinedSurveys, days_between, season_of
 from services.report.place import ends_of
@@ -77,9 +78,8 @@ def cautions(measured: CautionBasis, language: Language) -> Iterator[str]:
 
 
 def possibly_weak(view: BridgeView) -> tuple[Element, ...]:
-    """Return the resolved elements whose interval excludes no loss, but not a small one."""
-    lower = () if view.comparison is None else view.comparison.lower
-    return tuple(element for element in lower if element.number not in view.unresolved)
+    """Return the elements of a bridge that are possibly less stiff."""
+    return possibly_less_stiff(view.comparison, view.unresolved)
 
 
 def weak_before(view: BridgeView, before: Before | None) -> tuple[Element, ...]:
