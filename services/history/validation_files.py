@@ -102,7 +102,7 @@ def validation_notes(
             )
     if untried:
         trucks = language.listed(untried)
-        yield language.text("caution.unvalidated", trucks=trucks, folder=folder.absolute())
+        yield language.text("caution.unvalidated", trucks=trucks, folder=folder.absolute().name)
 
 
 def validations_passed(

@@ -75,7 +75,7 @@ tr.good td:first-child::before { content: "● "; }
   .measures td, .measures th { padding-top: 0.2mm; padding-bottom: 0.2mm; line-height: 1.25; }
   .note.how { display: none; }
   .past figure svg { max-height: 175mm; }
-  .first figure.wide svg { max-height: 41mm; }
+  .first figure.wide svg { max-height: 36mm; }
   .wide { overflow: visible; }
   h2, h3 { break-after: avoid; margin: 1.5mm 0 0; }
   h2 { font-size: 11pt; }

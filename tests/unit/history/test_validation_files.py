@@ -21,8 +21,9 @@ PAIR = VehicleBridgePair("truck-1", "bridge-1")
 
 def untried(folder: Path) -> str:
     return (
-        f"No site validation of truck-1 on this bridge in {folder}: whether the intervals contain "
-        "the truth has not been tested. Run driveby validate --site SITE.toml, or name its folder "
+        "No site validation of truck-1 on this bridge in the folder "
+        f"{folder.name}: whether the intervals contain the truth has not been tested. Run "
+        "driveby validate --site SITE.toml, or name its folder "
         "(--validations)."
     )
 
