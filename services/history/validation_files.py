@@ -105,6 +105,12 @@ def validation_notes(
         yield language.text("caution.unvalidated", trucks=trucks, folder=folder.absolute().name)
 
 
+def has_failed_validation(folder: Path, site: Site, pairs: Iterable[VehicleBridgePair]) -> bool:
+    """Return whether the validation record of any of these pairs has failed."""
+    records = (_record_of(folder, site, pair) for pair in pairs)
+    return any(record is not None and not record.passed for record in records)
+
+
 def validations_passed(
     folder: Path, site: Site, pairs: Iterable[VehicleBridgePair], language: Language = ENGLISH
 ) -> Iterator[str]:

@@ -16,6 +16,7 @@ from services.common.options import CERTIFICATES
 from services.execution.blas import one_blas_thread
 from services.history.bridge_history import BridgeHistory
 from services.history.validation_files import (
+    has_failed_validation,
     pairs_with_intervals,
     pairs_without_validation,
     validation_notes,
@@ -155,6 +156,7 @@ def _report(
     combined = None if before is not None else combined_surveys(_survey_files(name, about), used)
     pairs = pairs_without_validation(used)
     notes = tuple(validation_notes(validations, site, pairs, language))
+    failed = has_failed_validation(validations, site, pairs)
     passed = validations_passed(validations, site, pairs_with_intervals(used), language)
     basis = CautionBasis(bridge, view, used, before, combined, notes)
     return BridgeReport(
@@ -166,7 +168,7 @@ def _report(
         last.created,
         site,
         before,
-        _finding(view, crossings, stored, language),
+        _finding(view, crossings, stored, language, has_failed=failed),
         " ".join((quality(view, crossings, language), *repeated(repeats, language), *passed)),
         tuple(cautions(basis, language)),
         not notes,
@@ -284,6 +286,8 @@ def _finding(
     crossings: Sequence[CrossingResult],
     baseline: Estimate | None,
     language: Language,
+    *,
+    has_failed: bool,
 ) -> BridgeFinding:
     if view.estimate is None:
         return _no_finding(crossings, language)
@@ -298,6 +302,8 @@ def _finding(
         return BridgeFinding("open", language.text("finding.incomparable"), wording)
     weak = view.comparison.weak
     but = _but_implausible(view.comparison, language)
+    if has_failed:
+        but += " " + language.text("finding.validation_failed")
     if weak and view.ambiguous_neighbours:
         numbers = language.listed([str(one.number) for one in weak])
         headline = language.choice("finding.near", len(weak), elements=numbers)

@@ -969,6 +969,19 @@ def test_quality_states_simulation_and_passed_site_validation(site: Site, tmp_pa
     assert "passed" not in report.quality
 
 
+def test_a_failed_site_validation_is_in_the_headline(site: Site, tmp_path: Path) -> None:
+    """Who reads one line only must not take the finding for certain."""
+    save(tmp_path, certificate(site, passed=False))
+    failed = ENGLISH.text("finding.validation_failed")
+    for results, kind in ((without_weak(site, KNOWN), "open"), (fused(site, KNOWN), "weak")):
+        (plain,) = bridge_reports([(Path("x.json"), results, site)], None)
+        assert failed not in plain.finding.headline
+        (report,) = bridge_reports([(Path("x.json"), results, site)], None, validations=tmp_path)
+        assert report.finding.headline.endswith(failed)
+        assert report.finding.kind == kind
+    assert "appears less stiff" in report.finding.headline
+
+
 @pytest.mark.parametrize("is_weak", [False, True])
 def test_validation_is_a_next_step_where_the_finding_relies_on_intervals(
     site: Site, is_weak: bool
