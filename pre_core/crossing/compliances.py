@@ -30,6 +30,7 @@ from pre_core.crossing.posterior import (
 )
 from pre_core.crossing.preparation import mismatch_gradient
 from pre_core.kernels.lanes import inner, kernel
+from pre_core.search.convergence import CHAINS
 
 _SETTLING = 500
 _SWEEPS = 60
@@ -228,6 +229,19 @@ def draws(
     y[:, posterior.sampled] = sampled
     y[:, posterior.others] = (mean @ posterior.others_root.T + normal) @ posterior.others_root
     return y + MISMATCH_BIAS_SPREAD * rng.standard_normal((count, 1)) * posterior.bias_direction
+
+
+def present_points(found: Optimum, count: int, inflation: float, seed: int) -> FloatArray:
+    """Return points (k, f) of the density about an optimum, `count` at least, nothing absent."""
+    near = compliance_posterior(found, inflation)
+    near = near._replace(log_odds=never_absent(near.log_odds))
+    each = -(-count // CHAINS)
+    return np.concatenate([draws(near, each, seed, chain) for chain in range(CHAINS)])
+
+
+def never_absent(log_odds: FloatArray) -> FloatArray:
+    """Return log odds (n,) without chance of absence: only what the site file excludes is zero."""
+    return np.where(np.isposinf(log_odds), log_odds, -np.inf)
 
 
 @kernel

@@ -12,6 +12,7 @@ from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from pre_core.arrays import FloatArray
@@ -24,7 +25,7 @@ from pre_core.crossing.response_surface import (
 )
 from pre_core.crossing.weighted_draws import WeightedDraws, is_enough
 from pre_core.search import importance, tempering
-from pre_core.search.latent import LatentCoordinates
+from pre_core.search.latent import latent_coordinates
 from pre_core.search.loop import Report
 
 _MAX_ROUNDS = 12
@@ -35,6 +36,8 @@ _STEEPEST = 30.0
 _IMPOSSIBLE = 1e6
 """Residual of a point that is not possible."""
 _LEAST_SIZE = 1e-9
+_MOVES = (90,)
+"""Number of moves of every draw on a surface."""
 _START_SPREAD = 2.0
 """Width of the normal from which draws on a surface begin, relative to the points'."""
 
@@ -46,8 +49,21 @@ class DrawnDensity(NamedTuple):
     """Function from points (k, d) to the residuals (m, k) there."""
     prior_squares: Callable[[FloatArray], FloatArray]
     """Function from points (k, d) to the squares (k,) of their priors."""
-    latent: LatentCoordinates
+    half_normal: NDArray[np.int64]
+    """Indices of the coordinates that must not be negative."""
+    log_odds: FloatArray  # (d,) of zero, as in `latent_coordinates`
     inflation: float
+    completed: Callable[[FloatArray], "CompletedDraws"] | None = None
+    """Function from draws (k, d) to draws of more coordinates; None to weight the draws alone."""
+
+
+class CompletedDraws(NamedTuple):
+    """Draws of a few coordinates, completed with all others from a known density given these."""
+
+    residuals: FloatArray  # (m, k) as those of `DrawnDensity`, for the surface
+    y: FloatArray  # (k, f)
+    squares: FloatArray
+    """Minus twice the logarithm (k,) of the likelihood over the density of the completion."""
 
 
 class _Frame(NamedTuple):
@@ -76,9 +92,11 @@ class _Points(NamedTuple):
     """Points at which residuals have been evaluated, and what remains of these."""
 
     y: FloatArray  # (k, d)
-    squares: FloatArray  # (k,)
+    squares: FloatArray  # (k,) by which draws are weighted
     weight: FloatArray  # (k,) in fits
     sums: ParabolaSums
+    completed: FloatArray
+    """Completed draws (k, f); otherwise `y`."""
 
 
 def residual_draws(
@@ -87,10 +105,11 @@ def residual_draws(
     draws: int,
     rng: np.random.Generator,
     report: Report,
+    rounds: int = _MAX_ROUNDS,
 ) -> WeightedDraws:
-    """Return weighted draws (k, d), in rounds of n, the number of `first` points (n, d).
+    """Return weighted draws (k, d) or (k, f), in rounds of n, the number of `first` points (n, d).
 
-    Rounds end as soon as all draws are worth `draws` (`is_enough`), or after `_MAX_ROUNDS`.
+    Rounds end as soon as all draws are worth `draws` (`is_enough`), after `rounds` at the latest.
     """
     residuals = _residuals(density, first)
     level = float(log_density(density, first, np.sum(residuals**2, axis=0)).max())
@@ -101,17 +120,36 @@ def residual_draws(
         report("weighting draws of the posterior", 0.5 + 0.04 * len(used))
         used.append(_fit(frame, batches))
         new = _draws_on(density, used[-1], first.shape[0], rng)
-        batches.append(_evaluated(density, frame, new, _residuals(density, new)))
+        batches.append(_drawn(density, frame, new))
         weighted = _weighted(density, used, batches[1:])
-        if is_enough(weighted.worth, draws) or len(used) == _MAX_ROUNDS:
+        if is_enough(weighted.worth, draws) or len(used) == rounds:
             return weighted
 
 
 def _residuals(density: DrawnDensity, y: FloatArray) -> FloatArray:
     """Return residuals (m, k) at points y (k, d), huge where they are not finite."""
-    parts = range(0, y.shape[0], _TOGETHER)
-    found = [density.residuals(y[i : i + _TOGETHER]) for i in parts]
-    return np.nan_to_num(np.hstack(found), nan=_IMPOSSIBLE, posinf=_IMPOSSIBLE, neginf=_IMPOSSIBLE)
+    return _finite(np.hstack([density.residuals(some) for some in _parts(y)]))
+
+
+def _parts(y: FloatArray) -> list[FloatArray]:
+    return [y[i : i + _TOGETHER] for i in range(0, y.shape[0], _TOGETHER)]
+
+
+def _finite(residuals: FloatArray) -> FloatArray:
+    return np.nan_to_num(residuals, nan=_IMPOSSIBLE, posinf=_IMPOSSIBLE, neginf=_IMPOSSIBLE)
+
+
+def _drawn(density: DrawnDensity, frame: _Frame, y: FloatArray) -> _Points:
+    """Return evaluated draws y (k, d), completed if there is a function for it."""
+    if density.completed is None:
+        return _evaluated(density, frame, y, _residuals(density, y))
+    found = [density.completed(some) for some in _parts(y)]
+    points = _evaluated(density, frame, y, _finite(np.hstack([one.residuals for one in found])))
+    squares = np.concatenate([one.squares for one in found])
+    return points._replace(
+        squares=np.nan_to_num(squares, nan=_IMPOSSIBLE**2, posinf=_IMPOSSIBLE**2),
+        completed=np.concatenate([one.y for one in found]),
+    )
 
 
 def log_density(density: DrawnDensity, y: FloatArray, squares: FloatArray) -> FloatArray:
@@ -126,7 +164,7 @@ def _evaluated(
     higher = (log_density(density, y, squares) - frame.level) / y.shape[1]
     weight = np.exp(np.clip(higher, -_STEEPEST, _STEEPEST))
     sums = sums_of((y - frame.centre) / frame.size, residuals, weight)
-    return _Points(y, squares, weight, sums)
+    return _Points(y, squares, weight, sums, y)
 
 
 def _fit(frame: _Frame, batches: list[_Points]) -> _Fitted:
@@ -148,14 +186,16 @@ def _draws_on(
     density: DrawnDensity, fitted: _Fitted, count: int, rng: np.random.Generator
 ) -> FloatArray:
     """Return draws y (count, d) of the posterior with a surface in place of the residuals."""
-    latent = density.latent
+    covariance = fitted.root @ fitted.root.T
+    latent = latent_coordinates(density.half_normal, density.log_odds, fitted.mean, covariance)
 
     def target(v: FloatArray) -> FloatArray:
         y = latent.values(v)
         return log_density(density, y, fitted.squares(y)) + latent.log_share(v)
 
-    covariance = _START_SPREAD**2 * fitted.root @ fitted.root.T
-    return latent.values(tempering.tempered_draws(target, fitted.mean, covariance, count, 1, rng))
+    mean, root = latent.unexplained(fitted.mean), latent.unexplained(fitted.root)
+    start = _START_SPREAD**2 * root @ root.T
+    return latent.values(tempering.tempered_draws(target, mean, start, count, _MOVES, rng))
 
 
 def _weighted(density: DrawnDensity, used: list[_Fitted], batches: list[_Points]) -> WeightedDraws:
@@ -166,4 +206,5 @@ def _weighted(density: DrawnDensity, used: list[_Fitted], batches: list[_Points]
     of_used = half * np.stack([one.squares(y) for one in used], axis=1)
     counts = np.array([one.y.shape[0] for one in batches])
     log_weight = importance.mixture_log_weights(half * squares, of_used, counts)
-    return WeightedDraws(y, importance.pareto_smooth(log_weight))
+    completed = np.concatenate([one.completed for one in batches])
+    return WeightedDraws(completed, importance.pareto_smooth(log_weight))

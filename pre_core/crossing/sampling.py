@@ -1,7 +1,8 @@
 """Posterior draws of one crossing by adaptive importance sampling.
 
 Draws of a cheap density near the posterior (`surrogate`) are weighted by the posterior, and refine
-that density for the next draws. All batches are weighted as draws of one mixture density.
+that density for the next draws. All batches are weighted as draws of one mixture density. Where
+these do not suffice, draws of a density that may be curved are weighted (`conditional_draws`).
 """
 
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from scipy.special import log_ndtr
 
 from pre_core.arrays import FloatArray
 from pre_core.crossing import compliances, posterior, surrogate
+from pre_core.crossing.conditional_draws import conditional_draws
 from pre_core.crossing.fit import Optimum, normal_approximation
 from pre_core.crossing.mismatch import has_alike_tyres
 from pre_core.crossing.surface_posterior import (
@@ -35,6 +37,8 @@ _LARGEST_R_HAT = 1.05
 """Convergence limit of R-hat of rigidities and mass."""
 _MAX_RUNS = 14
 """Limit of draws with tyres of one kind, relative to the requested ones."""
+_PATIENCE = 10
+"""Number of batches after which draws of a normal likelihood go on only if they are on course."""
 _LEAST_ESS = 30.0
 """Effective number of draws below which their quantiles say nothing."""
 _NEGLIGIBLE_ODDS = 0.02
@@ -126,8 +130,15 @@ def _single_profile_draws(
 
     coordinates = surrogate.coordinates(found, inflation)
     first = surrogate.gauss_newton_surrogate(found, coordinates)
-    weighted = importance_draws(target, coordinates, first, found.state.y, draws, seed, report)
-    return _resample_to_chains(weighted, _monitored_indices(problem), draws, seed)
+    start, monitored = found.state.y, _monitored_indices(problem)
+    weighted = importance_draws(target, coordinates, first, start, draws, seed, report, _PATIENCE)
+    evaluations = weighted.y.shape[0]
+    if not is_enough(weighted.worth, draws):
+        other = conditional_draws(found, draws, seed, inflation, report)
+        evaluations += other.evaluations
+        weighted = max(weighted, other.weighted, key=lambda one: one.worth.ess)
+    chains = _resample_to_chains(weighted, monitored, draws, seed)
+    return chains._replace(evaluations=evaluations)
 
 
 def _resample_to_chains(

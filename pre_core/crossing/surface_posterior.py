@@ -43,8 +43,7 @@ from pre_core.crossing.weighted_draws import (
     importance_draws,
     is_enough,
 )
-from pre_core.search import convergence, importance
-from pre_core.search.latent import LatentCoordinates
+from pre_core.search import importance
 from pre_core.search.levenberg_marquardt import initial_state
 from pre_core.search.loop import Report
 
@@ -108,7 +107,8 @@ def drawn_by_residuals(
     density = DrawnDensity(
         partial(integrated_residuals, nuisances, has_step=True),
         partial(_prior_squares, _prior_centres(found)),
-        LatentCoordinates(half_normal, odds),
+        half_normal,
+        odds,
         inflation,
     )
     rivals, evaluations = _likely_rivals(found, nuisances, density)
@@ -189,12 +189,8 @@ def surface_posterior(found: Optimum, inflation: float, seed: int) -> SurfacePos
 
 def _points_of_normal(found: Optimum, count: int, inflation: float, seed: int) -> FloatArray:
     """Return points (count, n + 1) of the normal about the optimum, linear in c."""
-    near = compliances.compliance_posterior(found, inflation)
-    near = near._replace(log_odds=_never_absent(near.log_odds))
     kept = np.append(curved_coordinates(found), place_of_offset(found.problem))
-    chains = convergence.CHAINS
-    drawn = [compliances.draws(near, -(-count // chains), seed, chain) for chain in range(chains)]
-    return np.concatenate(drawn)[:, kept]
+    return compliances.present_points(found, count, inflation, seed)[:, kept]
 
 
 def _points_about_all(optima: list[Optimum], count: int, inflation: float, seed: int) -> FloatArray:
@@ -209,11 +205,6 @@ def _points_about_all(optima: list[Optimum], count: int, inflation: float, seed:
             for one, number in zip(optima, counts, strict=True)
         ]
     )
-
-
-def _never_absent(log_odds: FloatArray) -> FloatArray:
-    """Return log odds (n,) without chance of absence: only what the site file excludes is zero."""
-    return np.where(np.isposinf(log_odds), log_odds, -np.inf)
 
 
 def draw_curved(
@@ -241,7 +232,7 @@ def draw_curved(
     full = surrogate.coordinates(found, inflation)
     coordinates = surrogate.restricted(full, kept)
     if not may_be_absent:
-        coordinates = coordinates._replace(log_odds=_never_absent(coordinates.log_odds))
+        coordinates = coordinates._replace(log_odds=compliances.never_absent(coordinates.log_odds))
     near = surrogate.gauss_newton_surrogate(found, full)
     first = surrogate.Surrogate(*compliances.marginal(near.precision, near.linear, kept))
     return importance_draws(target, coordinates, first, found.state.y[kept], draws, seed, report)

@@ -38,8 +38,12 @@ def importance_draws(
     draws: int,
     seed: int,
     report: Report,
+    patience: int = _MAX_BATCHES,
 ) -> WeightedDraws:
     """Return weighted draws in batches, until they suffice (`is_enough`) or `_MAX_BATCHES` exist.
+
+    After `patience` batches they also end where as many effective ones in each batch as so far
+    would not suffice.
 
     Each batch is of a surrogate, `now` at first, that is refined by the draws so far; its chains
     start about `start` (f,). All draws are weighted as draws of the mixture of the surrogates.
@@ -63,7 +67,8 @@ def importance_draws(
         worth = importance.pareto_smooth(
             importance.mixture_log_weights(log_target, log_density, counts)
         )
-        if is_enough(worth, draws) or len(used) == _MAX_BATCHES:
+        limit = _MAX_BATCHES if _is_on_course(worth, draws, len(used)) else patience
+        if is_enough(worth, draws) or len(used) >= limit:
             return WeightedDraws(y, worth)
         now = surrogate.refine(
             now, coordinates, x, log_target, count, is_weighted=len(used) > _UNWEIGHTED_BATCHES
@@ -81,6 +86,11 @@ def _in_parts(target: LogDensity, y: FloatArray) -> FloatArray:
         [target(y[i : i + _MAX_POINTS]) for i in range(0, y.shape[0], _MAX_POINTS)]
     )
     return np.where(np.isfinite(found), found, -np.inf)
+
+
+def _is_on_course(worth: importance.SmoothedWeights, draws: int, batches: int) -> bool:
+    """Return whether `_MAX_BATCHES` are worth the requested number at the pace of these batches."""
+    return worth.ess * _MAX_BATCHES >= MIN_EFFECTIVE_SHARE * draws * batches
 
 
 def is_enough(worth: importance.SmoothedWeights, draws: int) -> bool:

@@ -32,11 +32,16 @@ from pre_core.fusion.path_groups import (
 )
 from pre_core.fusion.variability import change_root, marginalise_variability, varying_bridge
 from pre_core.search import tempering
-from pre_core.search.latent import LatentCoordinates
+from pre_core.search.latent import LatentCoordinates, latent_coordinates
 
 _WIDENED = 3.0
 """Width of the normal from which draws begin, relative to that about the most likely bridge."""
-_SNAPSHOTS = 2
+_WIDENED_AGAIN = 2.0
+"""The same, relative to the covariance of first draws, whose correlations the second ones use."""
+_LEAST_VARIANCE = 0.01
+"""Variance of first draws, relative to the normal's, below which they are too few to use."""
+_FIRST_MOVES, _MOVES = (6,), (45, 45)
+"""Numbers of moves of first and second draws before each snapshot."""
 
 
 class _CurvedCrossing(NamedTuple):
@@ -162,16 +167,47 @@ def curved_draws(
     threads: int = 1,
 ) -> FloatArray:
     """Return draws y (count, b) of the bridge's coordinates; they do not depend on `threads`."""
-    latent = LatentCoordinates(np.flatnonzero(~priors.coordinates.is_log), priors.log_odds)
-
-    each = -(-count // _SNAPSHOTS)
+    near = of.covariance / _WIDENED**2
+    cut_off = np.flatnonzero(~priors.coordinates.is_log)
+    each = -(-count // len(_MOVES))
     with ThreadPoolExecutor(threads) as pool:
 
-        def log_posterior(v: FloatArray) -> FloatArray:
+        def log_posterior(latent: LatentCoordinates, v: FloatArray) -> FloatArray:
             found = of.log_posterior(latent.values(v), pool) + latent.log_share(v)
             return np.where(np.isfinite(found), found, -np.inf)
 
+        # Far from the most likely bridge nothing follows restraints and bearings as it does there.
+        alone = latent_coordinates(cut_off, priors.log_odds, of.mean, np.diag(np.diag(near)))
+        target = partial(log_posterior, alone)
+        first = tempering.tempered_draws(
+            target,
+            of.mean,
+            of.covariance,
+            each,
+            _FIRST_MOVES,
+            rng,
+            lambda done: progress(0.5 * done),
+        )
+        y = alone.values(first)
+        mean, covariance = y.mean(axis=0), _covariance(y, near)
+        latent = latent_coordinates(cut_off, priors.log_odds, mean, covariance)
+        root = _WIDENED_AGAIN * latent.unexplained(np.asarray(np.linalg.cholesky(covariance)))
         drawn = tempering.tempered_draws(
-            log_posterior, of.mean, of.covariance, each, _SNAPSHOTS, rng, progress
+            partial(log_posterior, latent),
+            latent.unexplained(mean),
+            root @ root.T,
+            each,
+            _MOVES,
+            rng,
+            lambda done: progress(0.5 + 0.5 * done),
         )
     return latent.values(drawn[:count])
+
+
+def _covariance(y: FloatArray, near: FloatArray) -> FloatArray:
+    """Return the covariance (b, b) of draws y (k, b), with that of `near` where hardly any vary."""
+    covariance = np.cov(y.T)
+    for place in np.flatnonzero(np.diag(covariance) < _LEAST_VARIANCE * np.diag(near)):
+        covariance[place] = covariance[:, place] = 0.0
+        covariance[place, place] = near[place, place]
+    return np.asarray(covariance)

@@ -3,10 +3,11 @@
 A population follows a path of densities from a wide normal to the target (Del Moral, Doucet and
 Jasra 2006). Each step to the next density leaves half of the draws effective (Jasra et al. 2011),
 resamples them, and moves each by differences of others (ter Braak 2006), which follow the scales
-and directions of the population by themselves.
+and directions of the population by themselves. Moves of few coordinates are of those in which the
+first normal is white.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,8 +20,8 @@ _EFFECTIVE_SHARE = 0.5
 """Effective share of the draws after a step to the next density."""
 _HALVINGS = 40
 """Halvings of the interval that contains this step."""
-_MOVES, _LAST_MOVES = 6, 30
-"""Numbers of moves of every draw: at each density, and at the target before each snapshot."""
+_MOVES = 6
+"""Number of moves of every draw at each density."""
 _MAX_STEPS = 60
 _STEP = 2.38
 """Best length of moves along differences of draws from a normal, times the square root of twice the
@@ -29,8 +30,9 @@ _STEP_SPREAD = 0.4
 """Spread of the logarithm of that length."""
 _WHOLE = 0.1
 """Share of moves by a whole difference, from peak to peak."""
-_FEW = 0.4
-"""Share of the coordinates in every third move, which leaves the others as they are."""
+_FEW, _FEWER = 0.4, 2.0
+"""Share and mean number of the coordinates in every third move each, which leave the others: the
+one follows bends, the other reaches values that are zero or not."""
 
 
 class _Population(NamedTuple):
@@ -39,16 +41,9 @@ class _Population(NamedTuple):
     log_first: FloatArray
 
 
-class _Wide(NamedTuple):
-    """A normal, from which the population begins."""
-
-    mean: FloatArray  # (d,)
-    root: FloatArray  # (d, d) lower triangular root of the covariance
-
-    def log_density(self, x: FloatArray) -> FloatArray:
-        """Return the log density (k,) at x (k, d), up to a constant."""
-        z = np.linalg.solve(self.root, (x - self.mean).T)
-        return np.asarray(-0.5 * np.sum(z * z, axis=0))
+def _log_normal(z: FloatArray) -> FloatArray:
+    """Return the log density (k,) of a standard normal at z (k, d), up to a constant."""
+    return np.asarray(-0.5 * np.sum(z * z, axis=1))
 
 
 def tempered_draws(
@@ -56,19 +51,23 @@ def tempered_draws(
     mean: FloatArray,
     covariance: FloatArray,
     count: int,
-    snapshots: int,
+    moves: Sequence[int],
     rng: np.random.Generator,
     progress: Callable[[float], object] = lambda done: None,
 ) -> FloatArray:
-    """Return draws (snapshots * count, d) of a density, from a normal that is wider.
+    """Return draws (len(moves) * count, d) of a density, from a normal that is wider.
 
-    The normal has the `mean` (d,) and the `covariance` (d, d). The draws of a snapshot are
-    independent of each other except for resampling, and follow those of the previous one by moves
-    at the target. `progress` is called with the completed share.
+    The normal has the `mean` (d,) and the `covariance` (d, d). `moves` are the
+    numbers of moves of every draw at the target before each snapshot. Draws of a snapshot are
+    independent of each other except for resampling. `progress` is called with the completed share.
     """
-    wide = _Wide(mean, np.asarray(np.linalg.cholesky(covariance)))
-    x = mean + rng.standard_normal((count, mean.size)) @ wide.root.T
-    now = _Population(x, target(x), wide.log_density(x))
+    root = np.asarray(np.linalg.cholesky(covariance))
+
+    def whitened(z: FloatArray) -> FloatArray:
+        return target(mean + z @ root.T)
+
+    x = rng.standard_normal((count, mean.size))
+    now = _Population(x, whitened(x), _log_normal(x))
     power = 0.0
     for _ in range(_MAX_STEPS):
         progress(0.5 * power)
@@ -76,15 +75,15 @@ def tempered_draws(
         weight = np.exp(_relative(now, ahead - power))
         chosen = importance.systematic_resample(weight, count, rng)
         now, power = _Population(*(values[chosen] for values in now)), ahead
-        now = _moved(target, wide, now, power, _MOVES, rng)
+        now = _moved(whitened, now, power, _MOVES, rng)
         if power == 1.0:
             break
     found = []
-    for number in range(snapshots):
-        progress(0.5 + 0.5 * number / snapshots)
-        now = _moved(target, wide, now, 1.0, _LAST_MOVES, rng)
+    for number, some in enumerate(moves):
+        progress(0.5 + 0.5 * number / len(moves))
+        now = _moved(whitened, now, 1.0, some, rng)
         found.append(now.x)
-    return np.concatenate(found)
+    return np.asarray(mean + np.concatenate(found) @ root.T)
 
 
 def _relative(now: _Population, step: float) -> FloatArray:
@@ -111,7 +110,6 @@ def _next_power(now: _Population, power: float) -> float:
 
 def _moved(
     target: LogDensity,
-    wide: _Wide,
     now: _Population,
     power: float,
     moves: int,
@@ -123,14 +121,14 @@ def _moved(
         move = now.x[rng.integers(count, size=count)] - now.x[rng.integers(count, size=count)]
         length = np.exp(_STEP_SPREAD * rng.standard_normal(count))
         coordinates = np.full(count, float(d))
-        if number % 3 == 2:
-            some = rng.random((count, d)) < _FEW
+        if number % 3 > 0:
+            some = rng.random((count, d)) < (_FEW if number % 3 == 1 else _FEWER / d)
             move *= some
             coordinates = np.maximum(some.sum(axis=1), 1.0)
         length *= _STEP / np.sqrt(2.0 * coordinates)
         length[rng.random(count) < _WHOLE] = 1.0
         x = now.x + length[:, None] * move
-        new = _Population(x, target(x), wide.log_density(x))
+        new = _Population(x, target(x), _log_normal(x))
         gain = power * (new.log_target - now.log_target)
         gain += (1.0 - power) * (new.log_first - now.log_first)
         taken = np.log(rng.random(count)) < gain

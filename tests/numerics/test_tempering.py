@@ -13,7 +13,7 @@ SHARE = 0.3
 def drawn(target: object, d: int, spread: float, seed: int = 1, count: int = 2000) -> FloatArray:
     rng = np.random.default_rng(seed)
     mean, covariance = 0.5 * np.ones(d), spread**2 * np.eye(d)
-    return tempered_draws(target, mean, covariance, count, 2, rng)  # type: ignore[arg-type]
+    return tempered_draws(target, mean, covariance, count, (45, 45), rng)  # type: ignore[arg-type]
 
 
 def test_both_of_two_peaks_have_their_share() -> None:
