@@ -8,6 +8,7 @@ from pre_core.arrays import FloatArray
 from pre_core.crossing.fit import Optimum, chi2_stride, evaluations_of
 from pre_core.crossing.off_bridge import levels_at, off_bridge_residuals
 from pre_core.crossing.posterior import PosteriorProblem, all_rows, layout
+from pre_core.crossing.preparation import update_noise
 from pre_core.crossing.rows import RESIDUALS
 from pre_core.search.levenberg_marquardt import minimise
 
@@ -16,6 +17,10 @@ EXPLAINED_CHI2 = 1.5
 wrong span or an undeclared support acted on the bridge it was 1.0. With full weight of the
 body equations and one profile it was 25 or more where springs or profiles of fault-free
 crossings needed another model."""
+_MAX_REPEATS, _CLEARLY_LESS = 4, 0.8
+"""Limit of repeated fits, and the chi2 relative to the last one that another fit must reach."""
+_MAX_REPEATED_CHI2 = 10.0
+"""Value of `OffBridgeFit.chi2` above which the noise of another truck explains nothing."""
 _STEPS, _IMPROVEMENT = 12, 10.0
 """Limit of steps, and the improvement of the sum of squares that ends the fit, whose chi2 is judged
 coarsely."""
@@ -31,8 +36,28 @@ class OffBridgeFit(NamedTuple):
 
 
 def fit_off_bridge(found: Optimum) -> OffBridgeFit:
-    """Return the fit of truck and trajectory to the residuals off the bridge, from an optimum."""
-    problem, y = found.problem, found.state.y
+    """Return the fit of truck and trajectory to the residuals off the bridge, from an optimum.
+
+    The truck of a wrong bridge is a wrong one, and so is the noise that it transmits: the fit is
+    repeated with the noise of its own truck as long as this explains clearly more.
+    """
+    problem = found.problem
+    best = _fit_once(problem, found.state.y)
+    evaluations = best.evaluations
+    for _ in range(_MAX_REPEATS):
+        if not EXPLAINED_CHI2 < best.chi2 <= _MAX_REPEATED_CHI2:
+            break
+        problem = update_noise(problem, best.y, found.problem.force)
+        again = _fit_once(problem, best.y)
+        evaluations += again.evaluations
+        if again.chi2 > _CLEARLY_LESS * best.chi2:
+            break
+        best = again
+    return best._replace(evaluations=evaluations)
+
+
+def _fit_once(problem: PosteriorProblem, y: FloatArray) -> OffBridgeFit:
+    """Return the fit from y (size,) with the noise of the problem."""
     count = problem.noise.reciprocal.size
     is_off = np.zeros(count // RESIDUALS, dtype=np.bool_)
     for one in off_bridge_residuals(problem, y):
