@@ -24,6 +24,7 @@ from pre_core.crossing.surface_posterior import (
 )
 from pre_core.crossing.weighted_draws import (
     MIN_EFFECTIVE_SHARE,
+    WantedDraws,
     WeightedDraws,
     importance_draws,
     is_enough,
@@ -131,7 +132,8 @@ def _single_profile_draws(
     coordinates = surrogate.coordinates(found, inflation)
     first = surrogate.gauss_newton_surrogate(found, coordinates)
     start, monitored = found.state.y, _monitored_indices(problem)
-    weighted = importance_draws(target, coordinates, first, start, draws, seed, report, _PATIENCE)
+    wanted = WantedDraws(draws, _PATIENCE)
+    weighted = importance_draws(target, coordinates, first, start, wanted, seed, report)
     evaluations = weighted.y.shape[0]
     if not is_enough(weighted.worth, draws):
         other = conditional_draws(found, draws, seed, inflation, report)

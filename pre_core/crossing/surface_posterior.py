@@ -38,6 +38,7 @@ from pre_core.crossing.response_surface import (
     response_surface,
 )
 from pre_core.crossing.weighted_draws import (
+    WantedDraws,
     WeightedDraws,
     batch_size,
     importance_draws,
@@ -235,7 +236,8 @@ def draw_curved(
         coordinates = coordinates._replace(log_odds=compliances.never_absent(coordinates.log_odds))
     near = surrogate.gauss_newton_surrogate(found, full)
     first = surrogate.Surrogate(*compliances.marginal(near.precision, near.linear, kept))
-    return importance_draws(target, coordinates, first, found.state.y[kept], draws, seed, report)
+    start, wanted = found.state.y[kept], WantedDraws(draws)
+    return importance_draws(target, coordinates, first, start, wanted, seed, report)
 
 
 def complete(

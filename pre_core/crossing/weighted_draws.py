@@ -23,6 +23,13 @@ _MAX_POINTS = 100
 """Number of points evaluated together: their residuals take some megabytes."""
 
 
+class WantedDraws(NamedTuple):
+    """The number of draws, and of batches after which draws that are not on course end."""
+
+    number: int
+    patience: int = _MAX_BATCHES
+
+
 class WeightedDraws(NamedTuple):
     """Points y (k, f) and their smoothed weights."""
 
@@ -35,20 +42,20 @@ def importance_draws(
     coordinates: surrogate.SurrogateCoordinates,
     now: surrogate.Surrogate,
     start: FloatArray,
-    draws: int,
+    wanted: WantedDraws,
     seed: int,
     report: Report,
-    patience: int = _MAX_BATCHES,
 ) -> WeightedDraws:
     """Return weighted draws in batches, until they suffice (`is_enough`) or `_MAX_BATCHES` exist.
 
-    After `patience` batches they also end where as many effective ones in each batch as so far
+    After the wanted patience they also end where as many effective ones in each batch as so far
     would not suffice.
 
     Each batch is of a surrogate, `now` at first, that is refined by the draws so far; its chains
     start about `start` (f,). All draws are weighted as draws of the mixture of the surrogates.
     """
     centre = surrogate.transform(coordinates, start)
+    draws = wanted.number
     count = batch_size(draws)
     used: list[surrogate.Surrogate] = []
     y, x = np.empty((0, centre.size)), np.empty((0, centre.size))
@@ -67,7 +74,7 @@ def importance_draws(
         worth = importance.pareto_smooth(
             importance.mixture_log_weights(log_target, log_density, counts)
         )
-        limit = _MAX_BATCHES if _is_on_course(worth, draws, len(used)) else patience
+        limit = _MAX_BATCHES if _is_on_course(worth, draws, len(used)) else wanted.patience
         if is_enough(worth, draws) or len(used) >= limit:
             return WeightedDraws(y, worth)
         now = surrogate.refine(

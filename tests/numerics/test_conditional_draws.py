@@ -10,7 +10,12 @@ from pre_core.crossing import posterior, sampling, surrogate
 from pre_core.crossing.conditional_draws import conditional_draws
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.optimum import find_optimum
-from pre_core.crossing.weighted_draws import WeightedDraws, importance_draws, is_enough
+from pre_core.crossing.weighted_draws import (
+    WantedDraws,
+    WeightedDraws,
+    importance_draws,
+    is_enough,
+)
 from pre_core.search.importance import SmoothedWeights
 from pre_core.search.loop import Termination
 from schemas.settings import IdentificationSettings
@@ -57,7 +62,7 @@ def test_both_ways_draw_the_same_posterior(found: Optimum, inflation: float) -> 
 
     of = surrogate.coordinates(found, inflation)
     near = surrogate.gauss_newton_surrogate(found, of)
-    all_at_once = importance_draws(target, of, near, found.state.y, DRAWS, 2, silent)
+    all_at_once = importance_draws(target, of, near, found.state.y, WantedDraws(DRAWS), 2, silent)
     some = conditional_draws(found, DRAWS, 2, inflation, silent)
     assert is_enough(all_at_once.worth, DRAWS)
     assert is_enough(some.weighted.worth, DRAWS)
@@ -74,15 +79,15 @@ def test_both_ways_draw_the_same_posterior(found: Optimum, inflation: float) -> 
 def test_hopeless_draws_are_replaced(found: Optimum, monkeypatch: pytest.MonkeyPatch) -> None:
     """Draws of a normal likelihood that do not suffice: others are weighted, and all counted."""
     poor = SmoothedWeights(np.full(400, 1.0 / 400.0), 0.9, 40.0)
-    asked: list[int] = []
+    asked: list[WantedDraws] = []
 
     def few(*given: object) -> WeightedDraws:
-        asked.append(given[-1])  # type: ignore[arg-type]
+        asked.extend(one for one in given if isinstance(one, WantedDraws))
         return WeightedDraws(np.repeat(found.state.y[None, :], 400, axis=0), poor)
 
     monkeypatch.setattr(sampling, "importance_draws", few)
     drawn = sampling._single_profile_draws(found, DRAWS, 1, 1.0, silent)
-    assert asked == [sampling._PATIENCE]
+    assert asked == [WantedDraws(DRAWS, sampling._PATIENCE)]
     assert drawn.ending is Termination.STEPS_DONE
     assert drawn.ess > 400.0
     assert drawn.evaluations > 400

@@ -13,6 +13,7 @@ from pre_core.crossing import surrogate, weighted_draws
 from pre_core.search import importance
 
 COUNT = 4000
+WANTED = weighted_draws.WantedDraws(1200)
 SPARE = surrogate._NUISANCES
 """Coordinates that are not watched: as many as their principal directions that are."""
 
@@ -240,7 +241,7 @@ def test_weighted_draws_of_a_posterior_that_leans() -> None:
     of = coordinates(f, curved=np.array([0]), sigma=np.array([0.5]))
     centre = np.array([0.9, *np.zeros(SPARE)])  # not where it should be
     first = of_normal(centre, np.diag([1.3 * spread**2, *np.ones(SPARE)]))
-    y, worth = weighted_draws.importance_draws(target, of, first, np.zeros(f), 1200, 1, silent)
+    y, worth = weighted_draws.importance_draws(target, of, first, np.zeros(f), WANTED, 1, silent)
     assert weighted_draws.is_enough(worth, 1200)
     grid = np.linspace(-8.0, 6.0, 20_001)
     density = np.exp(log_density(grid))
@@ -266,7 +267,7 @@ def test_weighted_draws_give_up_where_tails_are_heavy(degrees: float) -> None:
         return np.asarray(-0.5 * (degrees + 1.0) * np.sum(np.log1p(y**2), axis=1))
 
     of, narrow = coordinates(20), of_normal(np.zeros(20), 0.5 * np.eye(20))
-    found = weighted_draws.importance_draws(target, of, narrow, np.zeros(20), 1200, 3, silent)
+    found = weighted_draws.importance_draws(target, of, narrow, np.zeros(20), WANTED, 3, silent)
     assert not weighted_draws.is_enough(found.worth, 1200)
     assert found.y.shape[0] == 400 * weighted_draws._MAX_BATCHES
 
