@@ -9,6 +9,7 @@ from typing import NamedTuple
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import CrossingResult, verdict_line
 from services.common.log_lines import about
+from services.common.naming import count_of
 from services.execution.dispatch import CrossingExecutor
 from services.identification.engine import Engine
 from services.worker.backfill import Backfill, WaitingCounts
@@ -29,6 +30,8 @@ class QueueLag(NamedTuple):
     messages: int
     lag_s: float
     """Longest wait in s of a message since the last health message."""
+    refused: int = 0
+    """Number of invalid messages refused since the start."""
 
 
 class Workload(NamedTuple):
@@ -81,10 +84,12 @@ def publish_health(
     notes += [f"{load.waiting} wait for a process"] if load.waiting else []
     recorded = load.in_recordings._asdict().items()
     notes += [f"{n} in recordings wait {_CAUSES[cause]}" for cause, n in recorded if n]
+    notes += [f"refused {count_of(behind.refused, 'invalid message')}"] if behind.refused else []
     notes += [note] if note else []
     figures = {
         "queue": float(behind.messages),
         "lag_s": behind.lag_s,
+        "refused": float(behind.refused),
         "identifying": float(len(running)),
         "identifying_longest_s": max((one.seconds for one in running), default=0.0),
         "waiting_for_process": float(load.waiting),

@@ -133,7 +133,8 @@ class Loop:
             self._next_health_s = time.monotonic() + HEALTH_PERIOD_S
             service.certificates.has_news = False
             self._load = load
-            service.publish_health(QueueLag(self._queued.qsize(), self._lag_s), load)
+            refused = service.refused.total()
+            service.publish_health(QueueLag(self._queued.qsize(), self._lag_s, refused), load)
             self._lag_s = 0.0
 
     def receive(self) -> list[TruckMessage]:
@@ -168,6 +169,7 @@ class Loop:
             except ValueError as error:
                 name = f"{one.key.stream} of {one.key.identifier}"
                 _log.warning("refused %s: %s", name, error)
+                self._service.refused["engine"] += 1
                 continue
             self._service.process_outputs(outputs)
 

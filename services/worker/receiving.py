@@ -5,6 +5,7 @@ import logging
 import queue
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -29,10 +30,20 @@ ArrivalsQueue = queue.Queue[TruckMessage | LivenessToken]
 class MessageReceiver:
     """The thread that receives, and the queue of what it has received and checked."""
 
-    def __init__(self, bus: zenoh.Session, realm: str, at_end: Callable[[], None]) -> None:
-        """Prepare the thread, which calls `at_end` when it ends for whatever reason."""
+    def __init__(
+        self,
+        bus: zenoh.Session,
+        realm: str,
+        at_end: Callable[[], None],
+        refused: Counter[str] | None = None,
+    ) -> None:
+        """Prepare the thread, which calls `at_end` when it ends for whatever reason.
+
+        It counts in `refused` what it refuses.
+        """
         self.queued: ArrivalsQueue = queue.Queue(_LONGEST_QUEUE)
         self._bus, self._realm, self._at_end = bus, realm, at_end
+        self._refused = Counter() if refused is None else refused
         self._closing, self._failed = threading.Event(), threading.Event()
         self._seen = SeenSequences()
         self._thread = threading.Thread(target=self._receive, name="receive", daemon=True)
@@ -92,6 +103,7 @@ class MessageReceiver:
                     key, identity = received.key(), received.identity()
                 except ValueError as error:
                     _log.warning("refused: %.200s", error)
+                    self._refused["receiver"] += 1
                     continue
                 self._take(received, key, identity, now_s)
         alive.undeclare()  # type: ignore[no-untyped-call]
@@ -109,6 +121,7 @@ class MessageReceiver:
             line = "refused %s of %s: %.200s"
             fields = about(vehicle=key.identifier)
             _log.warning(line, key.stream, key.identifier, error, extra=fields)
+            self._refused["receiver"] += 1
             return
         if self._seen.add(key, identity):
             self._put(TruckMessage(key, *identity, received.payload, now_s))

@@ -111,7 +111,7 @@ def _run(asked: WorkerSettings, search: Search, ready: Callable[[], None] | None
         if backfill is not None:
             stack.callback(backfill.close)
         execution.wait_until_warm()
-        receiver = MessageReceiver(bus, asked.realm, stop.set)
+        receiver = MessageReceiver(bus, asked.realm, stop.set, service.refused)
         try:
             service.resume(earlier)
             del earlier  # it covers two days

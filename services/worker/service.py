@@ -61,6 +61,8 @@ class WorkerService:
     files: ResultFiles
     verdicts: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(VERDICTS, 0)))
     """Numbers of this run's results, by verdict."""
+    refused: Counter[str] = field(default_factory=Counter)
+    """Numbers of invalid messages, by the thread that refused them: each counts on its own."""
 
     def publish(self, outputs: Iterable[Output]) -> None:
         """Write each message to the disk and only then to the bus.

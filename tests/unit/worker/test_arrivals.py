@@ -3,6 +3,7 @@
 import itertools
 import queue
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
@@ -14,8 +15,10 @@ import zenoh
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import ResultHeader
 from schemas.settings import IdentificationSettings
+from schemas.signals import Identity
 from schemas.topics import Key, topic
 from services.bus.publisher import Publisher
+from services.bus.subscription import RawSample
 from services.common.errors import FailureError
 from services.execution.inline import InlineExecutor
 from services.identification.engine import Engine
@@ -450,5 +453,20 @@ def test_a_malformed_message_is_refused_and_named(
     engine = Engine(paper_site(), SETTINGS, HEADER)
     stop = threading.Event()
     ready = threading.Timer(0.5, stop.set)
-    loop.Loop(service_of(engine, files), queued, stop).run(ready.start)
+    service = service_of(engine, files)
+    loop.Loop(service, queued, stop).run(ready.start)
     assert caplog.text.count("refused accel of truck-1") == 2
+    assert service.refused == {"engine": 2}
+
+
+def test_receiver_counts_what_it_refuses() -> None:
+    """The loop publishes this number; without it a refusal is a line of the log only."""
+    refused: Counter[str] = Counter()
+    receiver = receiving.MessageReceiver(cast("zenoh.Session", None), REALM, print, refused)
+    one = message(0.0)
+    other_schema = pb.AccelBatch(schema_version=99, boot_id=1).SerializeToString()
+    for payload in (b"\xff", other_schema, bytes(1 << 20)):
+        sample = RawSample(str(one.key), payload, None, False)
+        receiver._take(sample, one.key, Identity(1, 0), 0.0)
+    assert refused.total() == 3
+    assert receiver.queued.empty()

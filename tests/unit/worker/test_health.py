@@ -27,15 +27,17 @@ def test_note_names_the_start_of_an_identification(monkeypatch: pytest.MonkeyPat
         published.append,
         "worker",
         cast("CrossingExecutor", busy),
-        QueueLag(0, 0.0),
+        QueueLag(0, 0.0, refused=2),
         Workload(("a", "b"), 0, 0, WaitingCounts()),
         verdicts={},
         note="",
     )
     message = pb.Health.FromString(published[0])
     assert message.note == (
-        "a is being identified since 14:22:50 UTC; b is being identified since 14:23:16 UTC"
+        "a is being identified since 14:22:50 UTC; b is being identified since 14:23:16 UTC; "
+        "refused 2 invalid messages"
     )
     assert not re.search(r"for \d+ s", message.note)
     assert message.time_ns == round(1e9 * NOW_S)
     assert message.figures["identifying_longest_s"] == 30.0
+    assert message.figures["refused"] == 2.0
