@@ -5,7 +5,7 @@ as the worker does it; whether it can be identified is another question.
 """
 
 from array import array
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -17,6 +17,7 @@ from schemas.signals import NS_PER_S
 from schemas.site import Site
 from schemas.site_file import parse_site
 from schemas.topics import Key, Message, topic
+from services.catalogue.silences import Arrivals, Silence, no_arrivals, silences
 from services.common.errors import InputError
 from services.common.intervals import Intervals
 from services.common.progress import Offset, no_progress
@@ -25,12 +26,9 @@ from services.finding.drive import DriveMessages, Drives
 from services.finding.streams import batch_extent, boot_of, missing_samples
 from services.recordings.recording import RecordingInfo, read_info
 
-LONGEST_SILENCE_S = 1.0
-"""Silence in s that counts as a gap: a truck sends batches of 50 to 100 ms."""
-
 
 class Gap(NamedTuple):
-    """A silence of one stream while its truck was on; times in ns."""
+    """A silence of one stream that is no pause of its truck; times in ns."""
 
     vehicle: str
     stream: str
@@ -110,15 +108,18 @@ def summarise_recording(
     def note(message: Message) -> None:
         on_message(message)
         where = message.key
-        arrivals = streams.setdefault((where, message.boot_id), _StreamArrivals([], Intervals()))
+        arrivals = streams.setdefault(
+            (where, message.boot_id), _StreamArrivals(no_arrivals(), Intervals())
+        )
         if arrivals.sequences.add(message.sequence):
-            arrivals.times_ns.append(message.log_time_ns)
+            arrivals.received.add(message.log_time_ns, message.sequence)
             if where.owner == "vehicle" and where.stream == "accel":
                 extents.setdefault((where, message.boot_id), _Extents()).add(message)
         drives.add(message)
 
     info = read_info(path, note, progress)
     known, site_error = (site, None) if site is not None else _own_site(path, info.site_toml)
+    silent = list(silences((name, one.received) for name, one in streams.items()))
     latched = {where for where, _ in streams if topic(where.owner, where.stream).latched}
     times = [t for (where, _), h in streams.items() if where not in latched for t in h.times_ns]
     return RecordingSummary(
@@ -129,15 +130,20 @@ def summarise_recording(
         site_error,
         min(times, default=info.first_time_ns),
         max(times, default=info.last_time_ns),
-        _trucks(streams, _rates(drives.all()), _sample_gaps(extents)),
-        _gaps(streams),
+        _trucks(streams, _rates(drives.all()), _sample_gaps(extents, silent)),
+        _gaps(silent),
         () if known is None else _passings(known, drives.all()),
     )
 
 
 class _StreamArrivals(NamedTuple):
-    times_ns: list[int]
+    received: Arrivals
     sequences: Intervals
+
+    @property
+    def times_ns(self) -> "array[int]":
+        """Times of its messages, ns."""
+        return self.received.times_ns
 
 
 class _Extents:
@@ -145,6 +151,7 @@ class _Extents:
 
     def __init__(self) -> None:
         self._sequences, self._times_ns, self._sizes = array("q"), array("q"), array("q")
+        self._logged_ns = array("q")
         self._rate_hz = 0.0
 
     def add(self, message: Message) -> None:
@@ -157,26 +164,33 @@ class _Extents:
         self._sequences.append(message.sequence)
         self._times_ns.append(extent.device_time_ns)
         self._sizes.append(extent.samples)
+        self._logged_ns.append(message.log_time_ns)
 
-    def gaps_s(self) -> list[float]:
-        """Return the lengths of the gaps between samples, s."""
+    def gaps_s(self, pauses_ns: Sequence[int]) -> list[float]:
+        """Return the lengths of the gaps between samples in s; `pauses_ns` begin with a batch."""
         if not self._sequences:
             return []
-        sequences, times_ns, sizes = (
-            np.array(one) for one in (self._sequences, self._times_ns, self._sizes)
+        sequences, times_ns, sizes, logged_ns = (
+            np.array(one) for one in (self._sequences, self._times_ns, self._sizes, self._logged_ns)
         )
         order = np.argsort(sequences, kind="stable")
         missing = missing_samples(sequences[order], times_ns[order], sizes[order], self._rate_hz)
-        return [float(number) / self._rate_hz for number in missing[missing > 0]]
+        is_gap = (missing > 0) & ~np.isin(logged_ns[order][:-1], pauses_ns)
+        return [float(number) / self._rate_hz for number in missing[is_gap]]
 
 
 def _sample_gaps(
-    extents: Mapping[tuple[Key, int], _Extents],
+    extents: Mapping[tuple[Key, int], _Extents], silent: Iterable[Silence]
 ) -> dict[tuple[str, str], SampleGaps]:
     """Return the gaps of samples by realm and vehicle."""
     lengths: dict[tuple[str, str], list[float]] = {}
-    for (where, _), one in extents.items():
-        lengths.setdefault((where.realm, where.identifier), []).extend(one.gaps_s())
+    pauses: dict[tuple[Key, int], list[int]] = {}
+    for silence in silent:
+        if silence.is_pause:
+            pauses.setdefault((silence.where, silence.boot_id), []).append(silence.begin_ns)
+    for (where, boot_id), one in extents.items():
+        gaps_s = one.gaps_s(pauses.get((where, boot_id), []))
+        lengths.setdefault((where.realm, where.identifier), []).extend(gaps_s)
     return {
         truck: SampleGaps(len(some), sum(some), max(some, default=0.0))
         for truck, some in lengths.items()
@@ -247,18 +261,12 @@ def _stream(name: str, of_truck: list[_StreamArrivals]) -> StreamSummary:
     )
 
 
-def _gaps(streams: dict[tuple[Key, int], _StreamArrivals]) -> tuple[Gap, ...]:
-    """Return the silences within a boot; between two boots the truck was off."""
-    found = []
-    for (where, _), arrivals in streams.items():
-        if topic(where.owner, where.stream).nominal_rate_hz is None or where.owner != "vehicle":
-            continue
-        times = sorted(arrivals.times_ns)
-        found += [
-            Gap(where.identifier, where.stream, before, after)
-            for before, after in pairwise(times)
-            if after - before > LONGEST_SILENCE_S * NS_PER_S
-        ]
+def _gaps(silent: Iterable[Silence]) -> tuple[Gap, ...]:
+    found = [
+        Gap(one.where.identifier, one.where.stream, one.begin_ns, one.end_ns)
+        for one in silent
+        if not one.is_pause
+    ]
     return tuple(sorted(found, key=lambda gap: (gap.begin_ns, gap.vehicle, gap.stream)))
 
 

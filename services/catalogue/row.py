@@ -4,12 +4,13 @@ import hashlib
 import json
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import BinaryIO, Final, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 from mcap.writer import MCAP0_MAGIC
 
 from schemas.signals import NS_PER_S, decode_accel, decode_gnss
 from schemas.topics import Key, topic
+from services.catalogue.silences import Arrivals, no_arrivals, silences
 from services.common.errors import InputError
 from services.common.files import is_held
 from services.common.language import utc_day
@@ -19,8 +20,6 @@ from services.recordings.mcap_ranges import ChunkIndexes, chunk_messages, read_i
 from services.recordings.mcap_scan import RawMessage
 from services.recordings.recording import our_channel
 
-LONGEST_SILENCE_S: Final = 1.0
-"""Silence in s that counts as a gap: a truck sends batches of 50 to 100 ms."""
 _BLOCK_BYTES = 1 << 20
 
 
@@ -43,7 +42,7 @@ class CatalogRow(NamedTuple):
     rates_hz: dict[str, float]
     """Rate of each accelerometer, as its first batch declares it; observed rate of `gnss`."""
     gaps: int
-    """Number of silences of more than a second while a truck was on."""
+    """Number of silences of more than a second that are no pauses of a truck."""
     gap_s: float
     """Total length of the gaps in s."""
     box: Box | None
@@ -125,7 +124,7 @@ class _RowBuilder:
         self.messages = 0
         self._logged_ns: list[int] = []
         """First and last time of all messages."""
-        self._times: dict[tuple[Key, int], list[int]] = {}
+        self._arrivals: dict[tuple[Key, int], Arrivals] = {}
         self._rates: dict[str, float] = {}
         self._realms: set[str] = set()
         self._positions: list[tuple[float, float]] = []
@@ -139,7 +138,8 @@ class _RowBuilder:
             return
         row = topic(key.owner, key.stream)
         if not row.latched:
-            self._times.setdefault((key, boot_id), []).append(message.log_time_ns)
+            arrivals = self._arrivals.setdefault((key, boot_id), no_arrivals())
+            arrivals.add(message.log_time_ns, message.sequence)
         try:
             if key.stream == "gnss":
                 fix = decode_gnss(message.data)
@@ -151,12 +151,17 @@ class _RowBuilder:
             return  # it counts as a message and is otherwise ignored
 
     def row(self, entry: Entry, content: bytes) -> CatalogRow:
-        gaps = [gap for key, times in self._times.items() for gap in _gaps(key[0], times)]
-        every = [t for times in self._times.values() for t in (min(times), max(times))]
+        gaps = [
+            one.end_ns - one.begin_ns
+            for one in silences(self._arrivals.items())
+            if not one.is_pause
+        ]
+        times_ns = {name: one.times_ns for name, one in self._arrivals.items()}
+        every = [t for times in times_ns.values() for t in (min(times), max(times))]
         every = every or self._logged_ns
         steps = sorted(
             b - a
-            for (key, _), times in self._times.items()
+            for (key, _), times in times_ns.items()
             if key.stream == "gnss"
             for a, b in pairwise(sorted(times))
             if b > a
@@ -170,7 +175,7 @@ class _RowBuilder:
             entry.modified_ns,
             content,
             tuple(sorted(self._realms)),
-            tuple(sorted({key.identifier for key, _ in self._times})),
+            tuple(sorted({key.identifier for key, _ in times_ns})),
             min(every),
             max(every),
             self.messages,
@@ -179,14 +184,6 @@ class _RowBuilder:
             round(sum(gaps) / NS_PER_S, 3),
             _box(self._positions),
         )
-
-
-def _gaps(key: Key, times: list[int]) -> list[int]:
-    """Return the silences within a boot in ns; between two boots the truck was off."""
-    if topic(key.owner, key.stream).nominal_rate_hz is None:
-        return []
-    steps = (b - a for a, b in pairwise(sorted(times)))
-    return [step for step in steps if step > LONGEST_SILENCE_S * NS_PER_S]
 
 
 def _box(positions: list[tuple[float, float]]) -> Box | None:

@@ -1,14 +1,18 @@
 """What a recording holds, against recordings of which that is known."""
 
 import shutil
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
 
+from schemas.signals import decode_accel, encode_accel
 from schemas.site_file import load_site
 from schemas.topics import Key, Message
 from services.catalogue.contents import Gap, summarise_recording
+from services.catalogue.index import update_catalog
 from services.common.errors import InputError
+from services.common.stores import folder_at
 from services.drives.importing import import_command
 from services.drives.settings import ImportOptions
 from services.finding.stays import Passage
@@ -45,6 +49,43 @@ def test_between_two_boots_a_truck_was_off(tmp_path: Path) -> None:
     assert found.trucks[0].sample_gaps == (0, 0.0, 0.0)
     assert found.trucks[0].boots == 2
     assert found.trucks[0].streams["accel"] == (400, 0, pytest.approx(20.0))
+
+
+def as_one_boot(later: Iterable[Message]) -> Iterator[Message]:
+    """Yield the messages of a second drive an hour later as of the first one's boot."""
+    for message in later:
+        number = message.sequence + (200 if message.key.stream == "accel" else 100)
+        payload = message.payload
+        if message.key.stream == "accel":
+            batch = decode_accel(payload)
+            device_time_ns = batch.device_time_ns + 3600 * S
+            payload = encode_accel(batch._replace(sequence=number, device_time_ns=device_time_ns))
+        yield message._replace(payload=payload, sequence=number)
+
+
+@pytest.mark.parametrize("lost", [range(0), range(195, 200)])
+def test_pause_of_a_truck_without_lost_messages_is_no_gap(tmp_path: Path, lost: range) -> None:
+    """Drives that `driveby truck` publishes as one boot, with or without --skip-gaps."""
+    path = tmp_path / "r.mcap"
+    both = [*drive(leave_out=lost), *as_one_boot(drive(begin_s=3600.0))]
+    write_recording(path, both, site_toml=None, reason="test")
+    found = summarise_recording(path)
+    (row,) = update_catalog(folder_at(str(tmp_path))).rows.values()
+    assert found.trucks[0].streams["accel"].missing == len(lost)
+    assert [gap.stream for gap in found.gaps] == ["accel"] * bool(lost)
+    assert found.trucks[0].sample_gaps.number == bool(lost)
+    assert row.gaps == bool(lost)
+
+
+def test_silence_of_one_stream_without_lost_messages_is_a_gap(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    silent = [*drive(leave_out=range(100, 200))]
+    rest = [m for m in drive(begin_s=5.0, leave_out=range(30)) if m.key.stream == "accel"]
+    rest = [m._replace(sequence=m.sequence + 70) for m in rest]
+    write_recording(path, [*silent, *rest], site_toml=None, reason="test")
+    found = summarise_recording(path)
+    assert found.trucks[0].streams["accel"].missing == 0
+    assert [gap.stream for gap in found.gaps] == ["accel"]
 
 
 def test_gap_between_batches_in_sequence_is_counted(tmp_path: Path, csv_example: Path) -> None:
