@@ -3,7 +3,7 @@
 import contextlib
 import fcntl
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -52,7 +52,9 @@ class Recovery(NamedTuple):
     lost: int | None
     """Number of lost messages; None if the file does not show it."""
     missing_numbers: int
-    """Number of gaps in the written sequences, including those that the recording's events report.
+    """Number of absent sequence numbers of trucks' data, including those that events report.
+
+    Other streams are spread over files, or sent again: absent numbers are no loss.
     """
     damaged_places: int
     damaged_bytes: int
@@ -231,7 +233,7 @@ class _Copier:
         recovery = Recovery(
             messages=written,
             lost=lost,
-            missing_numbers=sum(_missing(numbers) for numbers in self._numbers.values()),
+            missing_numbers=sum(map(_missing, self._numbers_of_trucks())),
             damaged_places=self._damaged_places,
             damaged_bytes=self._damaged_bytes,
             is_cut_off=self._end is None,
@@ -239,6 +241,14 @@ class _Copier:
         )
         self._say(source, recovery, now_ns)
         return recovery
+
+    def _numbers_of_trucks(self) -> Iterator[Intervals]:
+        for channel_id, numbers in self._numbers.items():
+            named = _name(self._channels[channel_id])
+            if named is None or named[0].owner != "vehicle":
+                continue
+            if not topic("vehicle", named[0].stream).latched:
+                yield numbers
 
     def _metadata(self, record: Metadata) -> None:
         if record.name == END:

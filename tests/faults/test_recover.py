@@ -26,7 +26,7 @@ from services.common.errors import FailureError, InputError
 from services.recordings.mcap_scan import MAX_RECORD_BYTES
 from services.recordings.recording import read_info, read_messages, read_site
 from services.recordings.recovery import Recovery, recover_recording, recovered_path
-from services.recordings.writer import RecordingOrigin, RecordingWriter
+from services.recordings.writer import RecordingOrigin, RecordingWriter, write_recording
 
 NOW_NS = 1_700_000_000_000_000_000
 CHUNKS = 60
@@ -125,6 +125,18 @@ def test_an_undamaged_recording_is_clean(whole: Whole, tmp_path: Path) -> None:
     assert info.start["reason"] == "test"
     assert info.end is not None
     assert (info.end["reason"], info.end["dropped"]) == ("done", "0")
+
+
+def test_absent_numbers_of_other_streams_are_no_loss(tmp_path: Path) -> None:
+    """Events of one service are spread over the files of all trucks, `info` is sent again."""
+    path = tmp_path / "a.mcap"
+    keys = [
+        *(Key("live", "service", "logger", "event"), Key("live", "bridge", "bridge-1", "estimate")),
+        *(Key("live", "vehicle", "truck-1", "info"), Key("live", "vehicle", "truck-1", "gnss")),
+    ]
+    some = [Message(where, b"", 7, n, NOW_NS, NOW_NS) for where in keys for n in (0, 4, 9)]
+    write_recording(path, some, site_toml=None, reason="test")
+    assert recover_recording(path, recovered_path(path)).missing_numbers == 7
 
 
 @pytest.mark.parametrize("cut", ["begin", "end"])
