@@ -7,10 +7,15 @@ Knows Protocol Buffers and MCAP only; of this program it takes the messages' def
 import sys
 
 from mcap.reader import make_reader
+from mcap.writer import MCAP0_MAGIC
 
 from schemas.proto import driveby_pb2 as pb
 
 with open(sys.argv[1], "rb") as file:  # noqa: PTH123 - as short as it can be
+    file.seek(max(0, file.seek(0, 2) - len(MCAP0_MAGIC)))
+    if file.read() != MCAP0_MAGIC:
+        sys.exit(f"{sys.argv[1]}: has no end yet, or was cut off (driveby recover completes it)")
+    file.seek(0)
     for _, channel, message in make_reader(file).iter_messages():
         if not channel.topic.endswith("/estimate"):
             continue
