@@ -14,6 +14,8 @@ from schemas.toml_text import parse_toml, read_toml_text
 from services.common.errors import InputError
 
 CONFIG: Final = "--config"
+_ALIKE: Final = 0.7
+"""Least similarity of a misspelt key, from 0 to 1."""
 
 
 def with_config(parser: argparse.ArgumentParser, given: Sequence[str]) -> list[str]:
@@ -42,9 +44,10 @@ def options_by_key(parser: argparse.ArgumentParser) -> dict[str, argparse.Action
 
 
 def unknown_key(key: str, known: Iterable[str]) -> str:
-    """Return the sentence on a key that is none of the known ones, with the nearest of them."""
-    (close,) = difflib.get_close_matches(key.replace("-", "_"), list(known), n=1, cutoff=0.0)
-    return f"{key}: is unknown, did you mean {close}?"
+    """Return the sentence on a key that is none of the known ones, with one that is spelt alike."""
+    close = difflib.get_close_matches(key.replace("-", "_"), list(known), n=1, cutoff=_ALIKE)
+    hint = f"did you mean {close[0]}?" if close else "check its spelling or remove it"
+    return f"{key}: is unknown, {hint}"
 
 
 def _config_path(given: Sequence[str]) -> Path | None:
@@ -89,16 +92,20 @@ def _arguments_of(action: argparse.Action, where: str, value: object) -> Iterato
     for one in value if isinstance(value, list) else [value]:
         if isinstance(one, bool) or not isinstance(one, str | int | float):
             raise InputError(f"{where}: is {one!r}, it must be a text or a number")
-        yield f"{option}={_checked(action, where, str(one))}"
+        yield f"{option}={_checked(action, where, one)}"
 
 
-def _checked(action: argparse.Action, where: str, text: str) -> str:
-    """Return the text if the option accepts it."""
+def _checked(action: argparse.Action, where: str, value: str | float) -> str:
+    """Return the text of a value if the option accepts it."""
+    text = str(value)
+    parsed: object = text
     if callable(action.type):
         try:
-            action.type(text)
+            parsed = action.type(text)
         except (argparse.ArgumentTypeError, ValueError) as error:
             raise InputError(f"{where}: {error}") from None
+    if isinstance(parsed, str | Path) and not isinstance(value, str):
+        raise InputError(f'{where}: is {value!r}, it must be a text in quotes: "{text}"')
     if action.choices is not None and text not in action.choices:
         raise InputError(f"{where}: is {text!r}, it must be one of {', '.join(action.choices)}")
     return text
