@@ -38,6 +38,7 @@ from services.common.log_lines import about
 from services.logger.completeness import Completeness
 from services.logger.drops import QUEUE_IS_FULL, Drop
 from services.logger.file_layout import RecordingTarget
+from services.logger.folder_lock import locked_folder
 from services.logger.health_line import clock_note, health_line
 from services.logger.housekeeping import Housekeeping, RetentionPolicy
 from services.logger.intake import Intake
@@ -83,9 +84,9 @@ def run(asked: LoggerSettings, ready: Callable[[], None] | None = None) -> int:
     an earlier run without END are recovered meanwhile. `ready` is called once, when messages can be
     received. A second signal ends the process at once; the files stay readable.
 
-    Raise InputError for a file that exists or cannot be created, a malformed endpoint, realm or
-    site file; FailureError if the address is in use, the disk has too little space, or writing
-    failed.
+    Raise InputError for a file that exists or cannot be created, a folder in which another logger
+    records, a malformed endpoint, realm or site file; FailureError if the address is in use, the
+    disk has too little space, or writing failed.
     """
     limits = asked.limits
     place, realms = _check(asked, limits)
@@ -93,6 +94,7 @@ def run(asked: LoggerSettings, ready: Callable[[], None] | None = None) -> int:
     with (
         stopped_by_signals(on_second=leave_at_once) as stop,
         open_session(listen=asked.address, tls=asked.tls, insecure=asked.insecure) as bus,
+        locked_folder(asked.folder) if asked.file is None else contextlib.nullcontext(),
     ):
         writer = FileWriter(place, limits, own=own)
         try:
