@@ -133,11 +133,15 @@ def wait_for_router(
     while not is_over():
         # Zenoh itself would wait for ever, and Python would handle no signal.
         try:
-            return open_session(connect=endpoint, timeout_s=_CONNECT_S, tls=tls)
+            session = open_session(connect=endpoint, timeout_s=_CONNECT_S, tls=tls)
         except FailureError as error:
             if str(error) != logged:  # the cause may change, from no router to a wrong certificate
                 _log.warning("%s; retrying", error)
             logged = str(error)
+        else:
+            if logged:
+                _log.info("%s: connected", endpoint)
+            return session
     return None
 
 

@@ -1,10 +1,12 @@
 """The bus over real sessions in this process: identity, latching, fetching again, delivery."""
 
+import logging
 import socket
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -16,7 +18,7 @@ from schemas.topics import Key, selector
 from services.bus import subscription as subscription_module
 from services.bus.delivery import LINGER_S, DeliveryTracker
 from services.bus.publisher import Publisher
-from services.bus.session import open_session
+from services.bus.session import open_session, wait_for_router
 from services.bus.subscription import (
     RawSample,
     SeenSequences,
@@ -230,6 +232,22 @@ def test_without_a_logger_delivery_only_lingers(delivery: DeliveryTracker) -> No
 def test_nobody_answers(endpoint: str) -> None:
     with pytest.raises(FailureError, match=rf"^no router answers at {endpoint} within 0\.5 s"):
         open_session(connect=endpoint, timeout_s=0.5)
+
+
+def test_router_that_answers_late_is_logged_once(
+    endpoint: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    with ThreadPoolExecutor() as pool:
+        waiting = pool.submit(wait_for_router, endpoint, None, lambda: False)
+        until(lambda: bool(caplog.messages))
+        with open_session(listen=endpoint):
+            session = waiting.result(LONGEST_S)
+            assert session is not None
+            session.close()  # type: ignore[no-untyped-call]
+    first, second = caplog.messages
+    assert first.startswith(f"no router answers at {endpoint} ")
+    assert second == f"{endpoint}: connected"
 
 
 def test_client_connects_over_a_slow_link(router: zenoh.Session, endpoint: str) -> None:
