@@ -38,6 +38,7 @@ from services.common.log_lines import about
 from services.logger.completeness import Completeness
 from services.logger.drops import QUEUE_IS_FULL, Drop
 from services.logger.file_layout import RecordingTarget
+from services.logger.first_connection import FirstConnection
 from services.logger.folder_lock import locked_folder
 from services.logger.health_line import clock_note, health_line
 from services.logger.housekeeping import Housekeeping, RetentionPolicy
@@ -99,7 +100,7 @@ def run(asked: LoggerSettings, ready: Callable[[], None] | None = None) -> int:
         writer = FileWriter(place, limits, own=own)
         try:
             intake = Intake(place.realm, asked.service_id, own.boot_id)
-            logger = _Logger(place, realms, asked.service_id, writer, intake, own, asked.tls)
+            logger = _Logger(place, realms, asked.service_id, writer, intake, own, asked)
             with _rotated_by_signal(writer):
                 gone = _record(logger, bus, stop, ready, asked.budget_bytes)
         except BaseException:
@@ -134,7 +135,7 @@ class _Logger(NamedTuple):
     writer: FileWriter
     intake: Intake
     own: OwnEvents
-    tls: Path | None
+    asked: LoggerSettings
 
 
 def _record(
@@ -266,7 +267,8 @@ class _Announcements:
         self._drops: dict[tuple[str, str], Drop] = {}
         self._drops_reported_s: dict[tuple[str, str], float] = {}
         self._complaints = RateLimitedLog(_log, _EVENTS_LOGGED)
-        self._unlisted = UnlistedLog(bus, logger.tls)
+        self._unlisted = UnlistedLog(bus, logger.asked.tls)
+        self._first = FirstConnection(bus, logger.asked.address)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="announce", daemon=True)
         self._thread.start()
@@ -325,6 +327,7 @@ class _Announcements:
             self._publish_events()
             self._complaints.flush()
             self._unlisted.log_arrivals()
+            self._first.log(time.monotonic())
             is_due = closing or time.monotonic() >= next_durable_s
             if is_due and self._logger.writer.durable_version() != version:
                 next_durable_s = time.monotonic() + _DURABLE_PERIOD_S
