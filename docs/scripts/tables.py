@@ -36,11 +36,14 @@ from pathlib import Path
 from services.bus.messages import subscribe
 from services.common.errors import FailureError, InputError
 
-endpoint, keys, *tls = sys.argv[1:]
+(endpoint, keys, *tls), results = sys.argv[1:], {}
 try:
     for key, message in subscribe(endpoint, keys, tls=Path(tls[0]) if tls else None):
         found = getattr(message, "parameters", {})  # of an estimate; none if it was rejected
-        ei = (f"{n} {p.q025:.3g} to {p.q975:.3g}" for n, p in sorted(found.items()) if "EI_" in n)
+        ei = [f"{n} {p.q025:.3g} to {p.q975:.3g}" for n, p in sorted(found.items()) if "EI_" in n]
+        if key.stream == "estimate":  # repeats, as after a restart, replace
+            results[key.realm, message.crossing_id] = message
+            ei.append(f"({len(results)} results)")
         print(key.realm, key.identifier, key.stream, *ei, flush=True)
 except (FailureError, InputError) as error:
     sys.exit(str(error))
