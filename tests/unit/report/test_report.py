@@ -813,7 +813,7 @@ def test_a_finding_is_sound_only_where_a_large_loss_would_hardly_be_missed(site:
 
 def test_elements_that_cannot_be_compared_are_not_called_sound(site: Site) -> None:
     view = bridge_reports([(Path("x.json"), fused(site, KNOWN), site)], None)[0]
-    found = _finding(view.view._replace(comparison=None), (), None, ENGLISH)
+    found = _finding(view.view._replace(comparison=None), (), None, ENGLISH, has_failed=False)
     assert found.kind == "open"
     alone = view._replace(finding=found, view=view.view._replace(comparison=None))
     steps = " ".join(next_steps(alone, ENGLISH))
