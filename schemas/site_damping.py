@@ -23,10 +23,13 @@ _FAR: Final = 3.0
 
 
 class Damping(BaseModel):
-    """Keys that take the place of the Rayleigh coefficients; a valid file has none of them left."""
+    """Keys that take the place of the Rayleigh coefficients.
+
+    A valid site keeps only the declared frequency, to compare results with it.
+    """
 
     damping_ratio: Annotated[Number, Field(gt=0, le=0.5)] | None = None
-    first_frequency_hz: Annotated[Number, Field(gt=0, le=1000)] | None = None
+    first_frequency_hz: Annotated[Number | None, Field(gt=0, le=1000, exclude=True)] = None
 
 
 def rayleigh_of(ratio: float, first_hz: float) -> tuple[float, float]:
@@ -57,7 +60,7 @@ def with_coefficients(table: Any) -> Any:
     ):
         return table | dict.fromkeys(_COEFFICIENTS, 0.0)
     _check_frequency(table, values[1])
-    rest = {key: value for key, value in table.items() if key not in _KEYS}
+    rest = {key: value for key, value in table.items() if key != _KEYS[0]}
     return rest | dict(zip(_COEFFICIENTS, rayleigh_of(*values), strict=True))
 
 

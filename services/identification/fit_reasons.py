@@ -17,6 +17,7 @@ from pre_core.crossing.mismatch import pavement_ratio
 from pre_core.crossing.off_bridge import compared_length_m, mismatch_excess, rear_axle_chainage_m
 from pre_core.crossing.rows import RESIDUALS
 from pre_core.crossing.tandem_friction import tandem_friction
+from pre_core.physics.beam_basis import first_frequencies_hz
 from pre_core.search.loop import Termination
 from schemas.reasons import Reason
 from services.common.arrays import Floats
@@ -33,6 +34,9 @@ from services.identification.checks import (
     weak_excitation,
 )
 
+_CONTRADICTION = 1.2
+"""Factor between the fitted first frequency and the declared one that is a contradiction: an
+estimate from the span or another temperature is within it."""
 _UNEXPLAINED_CHI2 = 3.0
 """Value of chi2 off the bridge, fitted to that alone, from which the truck is not explained."""
 
@@ -75,7 +79,9 @@ def reasons_of_fit(
     about = {
         **slipped,
         **axles,
-        Reason.MODEL_MISFIT: _place_of_misfit(off_bridge_chi2),
+        Reason.MODEL_MISFIT: "; ".join(
+            filter(None, (_place_of_misfit(off_bridge_chi2), _wrong_bridge(data, found)))
+        ),
         Reason.NOISE_ABOVE_DECLARED: coarse,
         Reason.IMPLAUSIBLE_VEHICLE: odd_parameters(fit),
         Reason.TANDEM_FRICTION: f"about {100.0 * fit.tandem_friction:.2g} % of their load",
@@ -99,6 +105,26 @@ def _place_of_misfit(off_bridge_chi2: float) -> str:
     return (
         f"also before and after the bridge (χ² {off_bridge_chi2:.2g}); likely causes are another "
         "truck than declared, a faulty sensor, or different profiles under the axles"
+    )
+
+
+def _wrong_bridge(data: CrossingData, found: Optimum) -> str:
+    """Return how the fitted first frequency contradicts the declared one; "" if it does not."""
+    declared_hz = data.bridge.first_frequency_hz
+    if declared_hz is None:
+        return ""
+    theta = posterior.values_of(found.problem, found.state.y[None, :]).theta
+    fitted_hz = float(first_frequencies_hz(found.problem.crossing.basis, theta)[0])
+    return contradicted_frequency(fitted_hz, declared_hz)
+
+
+def contradicted_frequency(fitted_hz: float, declared_hz: float) -> str:
+    """Return the sentence on a first frequency far from the declared one; "" if it is near."""
+    if 1.0 / _CONTRADICTION <= fitted_hz / declared_hz <= _CONTRADICTION:
+        return ""
+    return (
+        f"its first frequency is {fitted_hz:.3g} Hz, declared {declared_hz:.3g} Hz, so the search "
+        "may have ended at a wrong bridge"
     )
 
 

@@ -8,12 +8,13 @@ import matplotlib
 import numpy as np
 import pytest
 
-from schemas.reasons import LEFT_OUT_TEXTS, REASON_TEXTS, BridgeReason, Reason
+from schemas.reasons import LEFT_OUT_TEXTS, REASON_TEXTS, BridgeReason, Reason, texts
 from schemas.results import results_json
 from schemas.site import Site
 from services.common.language import ENGLISH, LANGUAGES, Language, language_of
 from services.history.bridge_history import bridge_history
 from services.history.history_store import add_results
+from services.identification.fit_reasons import _place_of_misfit, contradicted_frequency
 from services.report.alarm_words import alarm_sentence
 from services.report.bridge import bridge_reports
 from services.report.history_section import history_section
@@ -96,6 +97,17 @@ def test_details_of_a_reason_are_kept_in_another_language() -> None:
     older = "Two channels seem to be exchanged: sprung_front and sprung_rear."
     assert GERMAN.reason("channel_swapped", older) == expected
     assert GERMAN.reason("channel_swapped", "<b>") == "Zwei Kanäle scheinen vertauscht zu sein."
+
+
+def test_german_misfit_names_place_and_frequency_in_german() -> None:
+    for off_bridge_chi2 in (1.0, 12.0):
+        details = "; ".join(
+            (_place_of_misfit(off_bridge_chi2), contradicted_frequency(5.1, declared_hz=3.3))
+        )
+        (stored,) = texts([Reason.MODEL_MISFIT], {Reason.MODEL_MISFIT: details})
+        german = GERMAN.reason("model_misfit", stored)
+        assert "Hz, angegeben sind 3.3 Hz, daher kann die Suche bei einer falschen" in german
+        assert not re.search(r"\b(the|and|bridge|likely|search|declared)\b", german), german
 
 
 def test_english_alarms_in_a_report_are_those_of_the_alarm() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from schemas.errors import InputError
-from schemas.site_file import load_site, parse_site
+from schemas.site_file import load_site, parse_site, site_hash
 from schemas.site_frequency import first_frequency_hz, given_frequencies
 from schemas.site_usual import implied_by, warnings_of
 
@@ -180,6 +180,15 @@ def by_frequency(first_hz: float, rigidity: float) -> str:
             *lines[where:],
         ]
     )
+
+
+def test_declared_first_frequency_is_kept_without_a_change_of_the_hash() -> None:
+    site = parse_site(by_frequency(3.29, 1.56e10), "site.toml")
+    (bridge,) = site.bridges
+    assert bridge.first_frequency_hz == 3.29
+    bare = bridge.model_copy(update={"first_frequency_hz": None})
+    assert site_hash(site) == site_hash(site.model_copy(update={"bridges": (bare,)}))
+    assert SITE.bridges[0].first_frequency_hz is None
 
 
 @pytest.mark.parametrize(("factor", "names_it"), [(1.0, False), (0.5, True), (2.0, True)])
