@@ -122,6 +122,9 @@ def line_of(certificate: ValidationRecord, path: Path, known: Site) -> str:
     std = "" if figures.std is None else f"; EI ± {100.0 * figures.std:.0f} %"
     if std and certificate.conditions.road == "groove":
         std += _one_profile(known.vehicle(certificate.vehicle))
+    road = certificate.conditions.road_class
+    if known.bridge(certificate.bridge).road_class is None:
+        std += f"; assumed road class {road} (road_class in the site file)"
     return f"{certificate.pair}: {how}{fewer}: {certificate.reason}{std}; {path}"
 
 

@@ -70,11 +70,12 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     question, planned = found.question, found.planned
     vehicle, bridge = planned.plan.site.vehicles[0], planned.plan.site.bridges[0]
     speeds = [crossing.speed_m_per_s for crossing in planned.plan.tracks[0]]
+    assumed = "" if found.road.road_class == bridge.road_class else " (assumed, --road)"
     tonnes = vehicle.total_mass_kg / 1e3
     yield f"{vehicle.id} ({tonnes:.1f} t, {tyres_of(planned)}) over {bridge.id}"
     yield (
         f"({bridge.span_m:g} m, {bridge.elements} elements), road of class "
-        f"{found.road.road_class}, {question.crossings} crossings"
+        f"{found.road.road_class}{assumed}, {question.crossings} crossings"
     )
     halves = ", ".join(f"half at {speed:.1f} m/s" for speed in speeds)
     yield f"assumed speeds: {halves}"

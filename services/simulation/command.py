@@ -18,6 +18,7 @@ from services.simulation.drive import (
     DrivenRoad,
     Measurement,
     OutOfModelEffects,
+    assumed_road,
     declared_site,
     densities_of,
     noise_density_of,
@@ -76,14 +77,14 @@ def _simulate_plane(
     effects = effects_of(asked)._replace(twist=twist)
     paths = None if surface is None else wheel_paths_of(known.vehicles[0], surface)
     of_noise = asked.seed if asked.drive_seed is None else asked.drive_seed
-    drives = []
+    road_class, drives = road_class_of(known, asked.road), []
     with steps_bar("simulating", console) as progress:
         for number in range(schedule.drives):
             progress(number, schedule.drives)
             drive = simulate_drive(
                 known,
                 ratios,
-                DrivenRoad(road_class_of(known, asked.road), asked.seed, paths),
+                DrivenRoad(road_class, asked.seed, paths),
                 Measurement(
                     noise,
                     rate_hz=asked.rate,
@@ -100,7 +101,8 @@ def _simulate_plane(
         messages = write_drives(asked.output, drives, site, force=asked.force, schedule=schedule)
     times = drives[0].run.accel_time_s
     console.print(
-        f"{asked.output}: {schedule.in_words(times[-1] - times[0])}, {messages} messages",
+        f"{asked.output}: {schedule.in_words(times[-1] - times[0])}, {messages} messages"
+        f"{assumed_road(known, road_class)}",
         highlight=False,
     )
     return 0

@@ -168,6 +168,12 @@ def road_class_of(site: Site, asked: str | None) -> str:
     return asked or site.bridges[0].road_class or "A"
 
 
+def assumed_road(site: Site, road_class: str) -> str:
+    """Return a note on a road class that the site's first bridge does not declare, or ""."""
+    declared = site.bridges[0].road_class
+    return "" if road_class == declared else f"; assumed road class {road_class} (--road)"
+
+
 def declared_site(site: Site, noise_ug_per_rthz: float | Densities, rate_hz: float) -> Site:
     """Return the site as the owner of this simulated truck would declare it, with sensor noise."""
     sensor = site.sensor.model_copy(

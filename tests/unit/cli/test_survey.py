@@ -257,7 +257,16 @@ def test_forecast_says_what_a_comparison_of_two_surveys_takes() -> None:
     assert "so each needs at least twice the crossings stated here" in text
 
 
+def test_forecast_of_a_declared_road_assumes_none() -> None:
+    found = made_up(9, {})
+    site = found.planned.plan.site
+    bridge = site.bridges[0].model_copy(update={"road_class": "A"})
+    plan = as_planned(site.model_copy(update={"bridges": (bridge,)}), 10.0)
+    text = "\n".join(lines_of(found._replace(planned=found.planned._replace(plan=plan))))
+    assert "road of class A, 12 crossings\n" in text
+
+
 def test_forecast_prints_the_speeds_it_assumes() -> None:
     text = "\n".join(lines_of(made_up(9, {})))
-    assert "road of class A, 12 crossings\n" in text
+    assert "road of class A (assumed, --road), 12 crossings\n" in text
     assert "\nassumed speeds: half at 8.5 m/s, half at 11.5 m/s\n" in text

@@ -93,6 +93,23 @@ def test_line_names_the_road_only_where_both_axles_share_it(
     assert "one road profile" not in line
 
 
+@pytest.mark.parametrize(("declared", "is_assumed"), [(None, True), ("B", False)])
+def test_line_names_the_road_class_that_the_site_lacks(
+    site: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    declared: str | None,
+    is_assumed: bool,
+) -> None:
+    known = load_site(site)
+    bridge = known.bridges[0].model_copy(update={"road_class": declared})
+    path = tmp_path / "road.toml"
+    path.write_text(site_toml(known.model_copy(update={"bridges": (bridge,)})))
+    assert validate("--site", path, "--validations", tmp_path / "here", "--truck", "truck-2") == 0
+    line = capsys.readouterr().out
+    assert ("; assumed road class B (road_class in the site file);" in line) == is_assumed
+
+
 @pytest.mark.parametrize(
     ("declared", "two"),
     [

@@ -74,6 +74,21 @@ def test_command_takes_the_road_of_the_site(axles: list[str], tmp_path: Path) ->
     assert written[0] == written[1] > 1.5 * written[2]
 
 
+@pytest.mark.parametrize("axles", [2, 3])
+def test_declared_road_class_is_not_called_assumed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], axles: int
+) -> None:
+    site = paper_site()
+    bridge = site.bridges[0].model_copy(update={"road_class": "C"})
+    file, out = tmp_path / "site.toml", tmp_path / "drive.mcap"
+    file.write_text(site_toml(site.model_copy(update={"bridges": (bridge,)})))
+    given = ["simulate", "--site", str(file), "--scenario", "6", "--speed", "20", "--rate", "100"]
+    assert main([*given, "--axles", str(axles), "-o", str(out)]) == 0
+    assert "assumed road class" not in capsys.readouterr().out
+    assert main([*given, "--axles", str(axles), "--road", "B", "-o", str(out), "--force"]) == 0
+    assert "; assumed road class B (--road)" in " ".join(capsys.readouterr().out.split())
+
+
 def test_truth_of_other_elements_names_the_option(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -260,7 +260,9 @@ def test_several_runs_over_one_surface_are_one_recording(
     path = tmp_path / "x.mcap"
     options = "--scenario 6 --seed 4 --noise 25 --rate 200 --speed 20 --road-surface --wander 0.12"
     assert cli.main(["simulate", *options.split(), "--runs", "2", "-o", str(path)]) == 0
-    assert "x.mcap: 2 runs of 7." in " ".join(capsys.readouterr().out.split())
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "x.mcap: 2 runs of 7." in printed
+    assert printed.endswith(" messages; assumed road class A (--road)")
     one, other = drives
     correlation = np.corrcoef(one.road.height_m, other.road.height_m)[0, 1]
     assert 0.9 < correlation < 1.0 - 1e-6
