@@ -46,6 +46,7 @@ from services.viewer.element_labels import (
     AFTER,
     BEFORE,
     anchors_clear_of,
+    arrow_names,
     change_texts,
     columns_gnm2,
     cut_height,
@@ -127,7 +128,7 @@ def _draw_panel(axes: Axes, bridge: BridgeView, language: Language) -> None:
     else:
         top = end_with_names(axes, max(top, _draw_state(axes, bridge, language)))
     axes.set_ylim(0.0, top)
-    legend_beside_title(axes)
+    legend_beside_title(axes, arrow_names(axes, language))
     title = language.text("figure.rigidity")
     if bridge.estimate is not None:
         title += f" {language.text(f'figure.numbers_{_meaning(bridge)}')}"

@@ -25,7 +25,13 @@ from services.viewer.drawing import (
     simplify_numbers,
     write_centred,
 )
-from services.viewer.element_labels import cut_height, draw_lines, end_with_names, name_elements
+from services.viewer.element_labels import (
+    arrow_names,
+    cut_height,
+    draw_lines,
+    end_with_names,
+    name_elements,
+)
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000")
 """Okabe and Ito's; more crossings than these are all in the first."""
@@ -53,7 +59,7 @@ def draw_crossings(
     road.set_ylabel(language.text("figure.height"))
     _draw_roads(road, crossings, language)
     for axes in (rigidity, road):
-        legend_beside_title(axes)
+        legend_beside_title(axes, arrow_names(axes, language))
         simplify_axes(axes)
         simplify_numbers(axes, language)
         mark_bridge(axes, (0.0, *bridge.interior_supports_m, bridge.span_m))

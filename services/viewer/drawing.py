@@ -17,6 +17,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import FancyBboxPatch, Rectangle
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
@@ -302,25 +303,31 @@ def simplify_numbers(axes: Axes, language: Language) -> None:
         axis.set_major_formatter(lambda value, _: language.number(round(value, 9), "g"))
 
 
-def legend_beside_title(axes: Axes) -> None:
-    """Place the legend on the line of the title, smaller where it is wider than the panel."""
-    handles, _ = axes.get_legend_handles_labels()
+def legend_beside_title(axes: Axes, also: Sequence[Line2D] = ()) -> None:
+    """Place the legend on the line of the title, smaller where it is wider than the panel.
+
+    The entries `also` follow those of the panel.
+    """
+    handles = [*axes.get_legend_handles_labels()[0], *also]
+    if not handles:
+        return
     is_long = len(handles) > 4
-    if handles:
+    size, room = 8.5 if is_long else 9.0, 1.0
+    for _ in range(2):
         legend = axes.legend(
+            handles=handles,
             loc="lower right",
             bbox_to_anchor=(1.008, 0.985),
             ncols=len(handles),
             columnspacing=1.1 if is_long else 1.6,
             handlelength=1.8 if is_long else 2.4,
             handletextpad=0.5 if is_long else 0.8,
-            fontsize=8.5 if is_long else 9,
+            fontsize=room * size,
             borderpad=0.0,
         )
         room = axes.get_window_extent().width / legend.get_window_extent().width
-        if room < 1.0:
-            for text in legend.get_texts():
-                text.set_fontsize(room * float(text.get_fontsize()))
+        if room >= 1.0:
+            return
 
 
 def write_centred(axes: Axes, text: str) -> None:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from matplotlib.markers import CARETUP
 
 from pre_core.constants import NORMAL_975
@@ -14,7 +15,7 @@ from schemas.results import RESOLVED
 from services.common.arrays import Floats
 from services.common.language import ENGLISH, Language
 from services.identification.comparison import Comparison, Estimate
-from services.viewer.drawing import BASELINE_COLOUR, MUTED, BarPlaces
+from services.viewer.drawing import BASELINE_COLOUR, INK, MUTED, BarPlaces
 
 _PLATE: dict[str, Any] = {
     "boxstyle": "round,pad=0.15",
@@ -103,6 +104,15 @@ def draw_lines(
             color=colour,
             zorder=6,
         )
+
+
+def arrow_names(axes: Axes, language: Language = ENGLISH) -> list[Line2D]:
+    """Return the legend's entry for arrows of values beyond the axis; a support has none."""
+    carets = (line for line in axes.lines if line.get_marker() == CARETUP)
+    if all(line.get_transform() != axes.transData for line in carets):
+        return []
+    look: dict[str, Any] = {"linestyle": "none", "marker": CARETUP, "color": INK}
+    return [Line2D([], [], label=language.text("figure.beyond"), **look)]
 
 
 def draw_baseline(

@@ -54,6 +54,7 @@ from services.viewer.element_labels import (
     AFTER,
     BEFORE,
     Anchors,
+    arrow_names,
     change_texts,
     columns_gnm2,
     cut_height,
@@ -216,7 +217,7 @@ def _draw_rigidity(
     elif truth is None:
         write_centred(axes, "\n".join(_explanation(crossing)))
     axes.set_ylim(0.0, top)
-    legend_beside_title(axes)
+    legend_beside_title(axes, arrow_names(axes))
     if not is_change:
         add_ratio_axis(axes, nominal)
 

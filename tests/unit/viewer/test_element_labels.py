@@ -89,11 +89,23 @@ def test_unresolved_element_leaves_the_axis_to_the_others(site: Site) -> None:
         drawn = arrows(axes)
         assert drawn, name
         assert all(np.max(arrow.get_ydata()) < top for arrow in drawn), name
+        assert legend(axes)[-1] == "beyond the axis", name
+        assert legend(axes).count("beyond the axis") == 1, name
+
+
+def test_legend_with_arrows_is_no_wider_than_its_panel(site: Site) -> None:
+    for name, axes in drawn_axes(site).items():
+        drawn = axes.get_legend()
+        assert drawn is not None
+        room = axes.get_window_extent().width
+        assert drawn.get_window_extent().width <= 1.02 * room, name
 
 
 def test_bridge_of_resolved_elements_has_no_arrow(site: Site) -> None:
     view = view_of_bridge(site.bridges[0], results_of(site, some_crossing("a"), used="a"), None)
-    assert not arrows(draw_bridge(view).axes[0])
+    axes = draw_bridge(view).axes[0]
+    assert not arrows(axes)
+    assert "beyond the axis" not in legend(axes)
 
 
 def test_names_of_elements_lie_on_no_interval(site: Site) -> None:
