@@ -51,6 +51,9 @@ svg { width: 100%; height: auto; display: block; }
 tr.suspect td:first-child::before { content: "○ "; }
 tr.rejected td:first-child::before { content: "× "; }
 tr.good td:first-child::before { content: "● "; }
+@media screen {
+  .first .wide td:nth-last-child(-n+2) { white-space: normal; overflow-wrap: break-word; }
+}
 @media screen and (max-width: 700px) {
   body { padding: 4mm; }
   h1 { font-size: 16pt; }

@@ -2,6 +2,7 @@
 
 import json
 import re
+import subprocess
 from collections.abc import Sequence
 from html.parser import HTMLParser
 from pathlib import Path
@@ -705,6 +706,30 @@ def test_on_paper_the_first_page_of_a_comparison_is_one_sheet(
     html.write_text(f"{first}<p>one more line</p></body></html>")
     pdf.write_pdf(html, tmp_path / "r.pdf", browser)
     assert number_of_sheets(tmp_path / "r.pdf") == 1
+
+
+_OVERFLOW = """<script>document.title = "overflow: " + [...document.querySelectorAll(
+"section.first .wide")].map(one => one.scrollWidth > one.clientWidth)</script>"""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("code", ["en", "de"])
+def test_table_of_a_comparison_fits_a_window_of_900_pixels(
+    site: Site, tmp_path: Path, browser: str, code: str
+) -> None:
+    then, html, words = tmp_path / "then.json", tmp_path / "r.html", language_of(code)
+    then.write_text(results_json(fused(site, KNOWN)))
+    ratios = RATIOS.copy()
+    ratios[3:6] *= 0.6, 2.0, 0.7
+    now = results_of(site, some_crossing("z", entry=9e6), used="z", ratios=ratios)
+    text = page(bridge_reports([(Path("z.json"), now, site)], then, language=words), language=words)
+    html.write_text(re.sub(r"<meta http-equiv[^>]*>", "", text) + _OVERFLOW)
+    command = [browser, "--headless", "--no-sandbox", f"--user-data-dir={tmp_path / 'profile'}"]
+    command += ["--window-size=900,1400", "--dump-dom", html.as_uri()]
+    seen = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
+    found = re.search(r"<title>overflow: (.*?)</title>", seen)
+    assert found is not None
+    assert set(found[1].split(",")) == {"false"}
 
 
 def test_fused_crossings_are_listed_with_their_agreement(site: Site) -> None:
