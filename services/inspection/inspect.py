@@ -71,6 +71,7 @@ def inspect(
 ) -> Iterator[CheckReport]:
     """Check a site file and recordings; InputError for an unreadable one, or without a site.
 
+    A finding that the site files of several recordings share is in the first report alone.
     `next_file` is called before each recording and returns its callback for progress.
     """
     sites = [path for path in paths if path.suffix == ".toml"]
@@ -80,10 +81,15 @@ def inspect(
     given = _text_of(sites[0]) if sites else None
     if given is not None:
         yield _of_site(given)
+    reported: set[CheckFinding] = set()
     for path in recordings:
         beside = site_text_beside(path) if given is None else given
         if given is None:
-            yield _of_site(beside)
+            of_site = _of_site(beside)
+            new = tuple(one for one in of_site.findings if one not in reported)
+            reported.update(new)
+            if new:
+                yield of_site._replace(findings=new)
         site, name = parse_site(*beside), beside.name
         for number, run in enumerate(recorded_runs(path, site, name, next_file())):
             yield CheckReport(

@@ -5,7 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from schemas.site_file import site_toml
 from services.cli import main as cli
+from services.recordings.writer import write_recording
+from services.simulation.drive import paper_site
+from tests.unit.drives.recorded import drive
 
 
 def test_the_sample_is_in_order(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -17,6 +21,35 @@ def test_the_sample_is_in_order(project: Path, capsys: pytest.CaptureFixture[str
     assert "unsprung_rear: noise 25" in out
     assert "bridge-1, start to end: 27 m recorded before it" in out
     assert lines[-1] == "0 wrong, 2 open"
+
+
+def test_shared_site_of_recordings_is_checked_once(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sample = str(project / "recordings/sample/crossing.mcap")
+    assert cli.main(["check", sample, sample]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if not line.startswith(" ")] == [
+        f"{sample}: site.toml",
+        f"{sample}, run 1 of truck-1",
+        f"{sample}, run 1 of truck-1",
+        "0 wrong, 2 open",
+    ]
+
+
+def test_recording_with_another_site_reports_what_differs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site, names = paper_site(), ("a.mcap", "b.mcap")
+    other = site.vehicles[0].model_copy(update={"cg_height_m": 1.1})
+    for name, truck in zip(names, (site.vehicles[0], other), strict=True):
+        text = site_toml(site.model_copy(update={"vehicles": (truck,)}))
+        write_recording(tmp_path / name, drive(), site_toml=text, reason="test")
+    cli.main(["check", *(str(tmp_path / name) for name in names)])
+    second = capsys.readouterr().out.partition("b.mcap: site.toml\n")[2]
+    of_site = second.partition("b.mcap, run")[0].splitlines()
+    (line,) = (one for one in of_site if one.startswith("  "))
+    assert line == "  ok     truck-1: centre of gravity 1.1 m above the road"
 
 
 def test_another_site_file_and_json(
