@@ -22,6 +22,8 @@ from services.planning.survey import MAX_CROSSINGS, PlanForecast, SurveyForecast
 
 _WORTH_NAMING: Final = 0.75
 """Share of the plan's crossings or smallest loss below which an alternative is worth a sentence."""
+_POSSIBLE: Final = 100
+"""Crossings beyond which a survey is no advice, unless more are planned."""
 _SMALLER_LOSS: Final = 0.95
 """The same share of the smallest loss where no number of crossings detects the loss in question."""
 
@@ -165,9 +167,12 @@ def _is_tandem_advised(found: SurveyForecast) -> bool:
 
 def _gain(one: PlanForecast, found: SurveyForecast) -> str:
     """Return what an alternative achieves, by the column of the table in which it is better."""
-    if one.needed_middle is None or _needed(one) == _needed(found.planned):
+    needed, planned = _needed(one), _needed(found.planned)
+    if one.needed_middle is None or needed[0] == inf or needed == planned:
         smallest = percent(one.expected.smallest_loss[one.middle])
         return f"{_detecting(found.question.crossings)} a loss of {smallest}"
+    if needed[0] == planned[0]:
+        return _ends(one)
     return f"{_detecting(one.needed_middle)} it, and {_ends(one)}"
 
 
@@ -201,13 +206,16 @@ def _rank(one: PlanForecast) -> tuple[float, float, float]:
 
 
 def _needed(one: PlanForecast) -> tuple[float, float]:
-    """Return the crossings needed at midspan and at both ends; infinite beyond MAX_CROSSINGS.
+    """Return the crossings needed at midspan and at both ends; infinite beyond what is possible.
 
     The ends count only where midspan is detected.
     """
-    if one.needed_middle is None:
-        return inf, inf
-    return one.needed_middle, inf if one.needed_ends is None else one.needed_ends
+    most = max(_POSSIBLE, one.expected.crossings)
+    middle, ends = (
+        inf if count is None or count > most else count
+        for count in (one.needed_middle, one.needed_ends)
+    )
+    return middle, ends if middle < inf else inf
 
 
 def warnings(found: SurveyForecast) -> Iterator[str]:

@@ -83,12 +83,27 @@ def test_alternative_that_needs_more_crossings_is_not_advised() -> None:
 
 def test_alternative_that_alone_detects_the_loss_is_advised() -> None:
     """It need not detect a smaller loss at the planned number of crossings."""
-    assert named(forecast((None, None, 0.5), late=(250, None, 0.5))) == ["late"]
+    assert named(forecast((None, None, 0.5), late=(90, None, 0.5))) == ["late"]
+
+
+def test_number_of_crossings_beyond_what_is_possible_is_no_advice() -> None:
+    assert NONE_HELPS in advice(forecast((None, None, 0.5), late=(216, None, 0.5)))
+    steep = advice(forecast((None, None, 0.5), steep=(216, None, 0.3)))
+    assert "helps most: steep; then 12 crossings detect a loss of 30 %." in steep
+    assert "216" not in steep
+    assert NONE_HELPS in advice(forecast((9, None, 0.3), ends=(9, 216, 0.3)))
+    assert named(forecast((None, None, 0.5), 250, late=(216, None, 0.5))) == ["late"]
+
+
+def test_change_that_needs_as_many_crossings_names_only_the_ends() -> None:
+    text = advice(forecast((2, 40, 0.2), ends=(2, 20, 0.2)))
+    assert "helps most: ends; then the ends need 20." in text
+    assert "then 2 crossings" not in text
 
 
 def test_hardly_fewer_crossings_are_not_worth_a_sentence() -> None:
     assert NONE_HELPS in advice(forecast((100, None, 0.3), same=(99, None, 0.3)))
-    assert named(forecast((100, None, 0.3), ends=(99, 200, 0.3))) == ["ends"]
+    assert named(forecast((100, None, 0.3), ends=(99, 100, 0.3))) == ["ends"]
 
 
 def test_gain_of_less_than_a_quarter_is_not_worth_a_sentence() -> None:
