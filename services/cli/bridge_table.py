@@ -86,7 +86,8 @@ def print_bridge(
     if not state.elements:
         return
     has_meaning = BridgeReason.NOT_FUSED not in state.reasons
-    print_elements(console, bridge, state.elements, has_meaning, state.probability_of_loss)
+    losses, is_doubtful = state.probability_of_loss, state.verdict != "good"
+    print_elements(console, bridge, state.elements, has_meaning, losses, is_doubtful=is_doubtful)
     if state.finding is not None:
         print_finding(console, bridge, state)
         if state.probability_of_loss is None and len(_days(state)) > 1:
@@ -210,10 +211,13 @@ def print_elements(
     elements: Mapping[str, Parameter | ElementState],
     has_meaning: bool,
     losses: Mapping[str, Mapping[str, float]] | None,
+    *,
+    is_doubtful: bool = False,
 ) -> None:
     """Print a line for each element; `has_meaning` is whether intervals have one.
 
-    `losses` are probabilities, by element and per cent of the baseline.
+    `losses` are probabilities, by element and per cent of the baseline. Those of a doubtful
+    measurement have a question mark, as in reports; unresolved elements have none.
     """
     from rich.table import Table
 
@@ -234,7 +238,7 @@ def print_elements(
     percents = list(next(iter(losses.values()))) if losses else []
     if losses:
         table.add_column(f"probability\nlost {'/'.join(percents)}", justify="right")
-    start = 0.0
+    start, unresolved, doubt = 0.0, unresolved_elements(every), "?" if is_doubtful else ""
     for number, (length, sound) in enumerate(
         zip(bridge.lengths_m, bridge.nominal_flexural_rigidity_nm2, strict=True), start=1
     ):
@@ -245,9 +249,9 @@ def print_elements(
             if has_meaning and not (losses and unit == sound):
                 row.append(f"{p.q025 / unit:.{digits}f} … {p.q975 / unit:.{digits}f}")
         if losses:
-            of = losses.get(f"EI_{number}", {})
+            of = {} if number in unresolved else losses.get(f"EI_{number}", {})
             stated = "/".join(f"{100.0 * of[p]:.0f}" for p in percents if p in of)
-            row.append(f"{stated} %" if stated else "not resolved")
+            row.append(f"{stated} %{doubt}" if stated else "not resolved")
         table.add_row(*row)
         start += length
     console.print(table)

@@ -328,6 +328,7 @@ def _print_crossing(
         crossing.parameters,
         "no_noise_model" not in crossing.reasons,
         None if crossing.derived is None else _below(crossing.derived),
+        is_doubtful=crossing.verdict != "good",
     )
     unresolved = unresolved_names(crossing)
     if unresolved:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from schemas.results import BridgeResult, CrossingResult, ElementState, Track
+from schemas.results import BridgeResult, CrossingResult, ElementState, Results, Track
 from services.cli.bridge_table import print_bridge
 from services.cli.identify import _print
 from services.cli.main import main
@@ -139,3 +139,24 @@ def test_what_is_found_without_a_baseline_is_no_all_clear(has_baseline: bool) ->
     text = file.getvalue()
     assert ("Possibly less stiff: element 2 (−25 %" in text) != has_baseline
     assert ("--baseline EARLIER.json" in text) != has_baseline
+
+
+@pytest.mark.parametrize(("verdict", "mark"), [("good", ""), ("suspect", "?")])
+def test_losses_of_a_crossing_are_marked_where_they_are_doubtful(
+    capsys: pytest.CaptureFixture[str], verdict: str, mark: str
+) -> None:
+    """Element 2 has an interval from 0.05 to 4 of nominal: no loss of it is determined."""
+    site = paper_site()
+    reasons = () if verdict == "good" else ("model_misfit",)
+    content = results_of(site, some_crossing("a", verdict=verdict, reasons=reasons)).model_dump()
+    (one,) = content["crossings"]
+    nominal = site.bridges[0].nominal_flexural_rigidity_nm2[1]
+    wide = {"mean": nominal, "std": nominal, "q025": 0.05 * nominal, "q975": 4.0 * nominal}
+    one["parameters"]["EI_2"] |= wide
+    below = {f"EI_{n}": 1.0 for n in range(1, 8)}
+    one["derived"]["probability_below_90_percent_of_baseline"] = below
+    _print(Console(width=200), Results.model_validate(content), site)
+    lines = capsys.readouterr().out.splitlines()
+    rows = {line.split()[0]: line.rstrip() for line in lines if line.split()[:1]}
+    assert rows["EI_2"].endswith(" not resolved")
+    assert rows["EI_4"].endswith(f" 100 %{mark}")
