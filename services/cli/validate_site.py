@@ -10,6 +10,7 @@ from schemas.settings import IdentificationSettings
 from schemas.site import Site, Vehicle
 from schemas.site_file import load_site
 from schemas.validation_records import (
+    ValidationCrossing,
     ValidationRecord,
     VehicleBridgePair,
     pair_hash,
@@ -22,7 +23,7 @@ from services.common.language import ENGLISH
 from services.common.naming import count_of, processes_in_words
 from services.common.progress import progress_bar, start_line
 from services.common.truck_choice import TRUCK_CHOICES, truck_to_try
-from services.history.validation_files import save
+from services.history.validation_files import frequent_reasons, save
 from services.simulation.trial_truth import CROSSINGS
 from services.simulation.validation_options import CertificateOptions
 from services.simulation.validation_trial import (
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
 
 _AFTER_FAILURE: Final = (
-    "do not rely on intervals of a pair that failed: check the site file, try {remedy}, and "
+    "Do not rely on intervals of a pair that failed: check the site file, try {remedy}, and "
     "validate again"
 )
 
@@ -65,7 +66,7 @@ def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
         f"validating {trials} of truck and bridge: at most {CROSSINGS} simulated crossings each, "
         f"on {processes_in_words(asked.processes)}",
     )
-    failed = set()
+    failed, tried = set(), list[ValidationCrossing]()
     # A fork is impossible: the threads of numba and OpenBLAS would not survive it.
     with (
         progress_bar(console) as bar,
@@ -82,11 +83,14 @@ def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
             path = save(asked.validations, certificate)
             if not certificate.passed:
                 failed.add(truck_to_try(known.vehicle(pair.vehicle), known.bridge(pair.bridge)))
+                tried += certificate.crossings
             console.print(line_of(certificate, path, known), highlight=False, soft_wrap=True)
     if failed:
         kind = min(failed, key=TRUCK_CHOICES.index)
         remedy = ENGLISH.text(f"caution.try.{kind}")
-        console.print(_AFTER_FAILURE.format(remedy=remedy), highlight=False, soft_wrap=True)
+        advice = _AFTER_FAILURE.format(remedy=remedy)
+        lines = " ".join(filter(None, (frequent_reasons(tried), advice)))
+        console.print(lines, highlight=False, soft_wrap=True)
     return int(bool(failed))
 
 

@@ -1,7 +1,7 @@
 """Validation records of a folder: writing them, the passed ones, and what is not validated."""
 
 import logging
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -10,6 +10,7 @@ from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.validation_records import (
     LEAST_COVERAGE,
+    ValidationCrossing,
     ValidationRecord,
     VehicleBridgePair,
     load_validation,
@@ -23,6 +24,9 @@ from services.common.language import ENGLISH, Language
 from services.common.truck_choice import truck_to_try
 
 _log = logging.getLogger(__name__)
+
+_MAX_REASONS = 2
+"""Maximum number of reasons that a failed validation is explained by."""
 
 
 def save(folder: Path, certificate: ValidationRecord) -> Path:
@@ -90,7 +94,7 @@ def validation_notes(
         elif not record.passed:
             figures = record.figures
             kind = truck_to_try(site.vehicle(pair.vehicle), site.bridge(pair.bridge))
-            yield language.text(
+            text = language.text(
                 "caution.validation_failed",
                 truck=pair.vehicle,
                 good=figures.good,
@@ -100,6 +104,7 @@ def validation_notes(
                 least=100.0 * LEAST_COVERAGE,
                 remedy=language.text(f"caution.try.{kind}"),
             )
+            yield " ".join(filter(None, (text, frequent_reasons(record.crossings, language))))
     if untried:
         trucks = language.listed(untried)
         yield language.text("caution.unvalidated", trucks=trucks, folder=folder.absolute().name)
@@ -109,6 +114,15 @@ def has_failed_validation(folder: Path, site: Site, pairs: Iterable[VehicleBridg
     """Return whether the validation record of any of these pairs has failed."""
     records = (_record_of(folder, site, pair) for pair in pairs)
     return any(record is not None and not record.passed for record in records)
+
+
+def frequent_reasons(tried: Iterable[ValidationCrossing], language: Language = ENGLISH) -> str:
+    """Return a sentence on the usual reasons of crossings that are not good; "" without any."""
+    counted = Counter(code for one in tried if one.verdict != "good" for code in one.reasons)
+    usual = sorted(counted.items(), key=lambda item: (-item[1], item[0]))[:_MAX_REASONS]
+    sentences = ((language.reasons.get(code, code), number) for code, number in usual)
+    listed = "; ".join(f"{text.removesuffix('.')} ({number})" for text, number in sentences)
+    return language.text("caution.validation_reasons", reasons=listed) if listed else ""
 
 
 def validations_passed(

@@ -60,6 +60,10 @@ def test_every_pair_gets_a_line_and_a_file(
     assert validate("--site", site, "--validations", folder, "--seed", 4) == 1
     *lines, advice = capsys.readouterr().out.splitlines()
     assert "fewer elements or a truck with equal single tyres or an equalised tandem, and" in advice
+    assert advice.startswith(
+        "Most frequent reasons of crossings that were not good: The model does not explain the "
+        "measured accelerations (10). Do not rely on intervals of a pair that failed: check"
+    )
     assert [line.split(":")[0] for line in lines] == [
         "truck-1 on bridge-1",
         "truck-1 on bridge-2",

@@ -1,6 +1,7 @@
 """Sentences on results that no passed site validation covers."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,7 +14,7 @@ from services.history.validation_files import (
     validation_notes,
     validations_passed,
 )
-from tests.builders.certificates import certificate
+from tests.builders.certificates import certificate, tried
 from tests.unit.viewer.found import results_of, some_crossing
 
 PAIR = VehicleBridgePair("truck-1", "bridge-1")
@@ -72,6 +73,25 @@ def test_record_of_the_pair_decides(site: Site, tmp_path: Path) -> None:
     assert "NICHT bestanden: 12 von 12 simulierten Überfahrten" in german
     save(tmp_path, certificate(site))
     assert list(validation_notes(tmp_path, site, [PAIR])) == []
+
+
+def test_failed_record_names_the_usual_reasons_in_words(site: Site, tmp_path: Path) -> None:
+    """The third reason is the rarest; reasons of good crossings do not exist."""
+    none: dict[str, Any] = dict.fromkeys(("ei_ratio_q025", "ei_ratio_q50", "ei_ratio_q975"), ())
+    codes = (("model_misfit",), ("not_converged",), ("not_converged", "model_misfit"), ("failed",))
+    crossings = [tried(4), tried(5, verdict="suspect", reasons=("not_converged",))]
+    crossings += [tried(n, verdict="rejected", reasons=why, **none) for n, why in enumerate(codes)]
+    save(tmp_path, certificate(site, passed=False, crossings=crossings))
+    (line,) = validation_notes(tmp_path, site, [PAIR])
+    assert line.endswith(
+        "and validate again. Most frequent reasons of crossings that were not good: The search did "
+        "not converge (3); The model does not explain the measured accelerations (2)."
+    )
+    (german,) = validation_notes(tmp_path, site, [PAIR], language_of("de"))
+    assert german.endswith(
+        "die nicht gut waren: Die Suche ist nicht konvergiert (3); Das Modell erklärt die "
+        "gemessenen Beschleunigungen nicht (2)."
+    )
 
 
 def test_passed_record_states_the_fewest_intervals_that_pass(site: Site, tmp_path: Path) -> None:
