@@ -69,6 +69,8 @@ def latent_coordinates(
         left -= np.outer(slope, left[place])
         # Those before it, and itself, have nothing left to follow.
         slope[order[: number + 1]] = 0.0
+        # What a value itself follows, its followers no longer follow directly.
+        follow[:, :number] -= np.outer(slope, follow[place, :number])
         follow[:, number] = slope
     return LatentCoordinates(order, log_odds[order], np.sqrt(np.diag(covariance)[order]), follow)
 
