@@ -13,6 +13,7 @@ from pre_core.crossing.channels import channel_signals
 from pre_core.crossing.comparison import is_better, minus_two_log_posterior
 from pre_core.crossing.fit import Optimum, chi2_per_dof, is_accepted
 from pre_core.crossing.misfit import fit_off_bridge
+from pre_core.crossing.noise import no_suspension_noise
 from pre_core.crossing.posterior import (
     ChainageFixes,
     PosteriorProblem,
@@ -459,9 +460,8 @@ def test_a_wrong_bridge_is_no_misfit_off_it(here: Case) -> None:
 
 
 def test_noise_of_three_times_the_declared_is_a_misfit_off_the_bridge(here: Case) -> None:
-    noise = here.problem.noise
-    quieter = noise._replace(factor=noise.factor / 3.0, reciprocal=3.0 * noise.reciprocal)
-    found = optimum_at(here.problem._replace(noise=quieter), here.y)
+    quieter = here.problem._replace(density=here.problem.density / 3.0)
+    found = optimum_at(update_noise(quieter, here.y, no_suspension_noise()), here.y)
     assert fit_off_bridge(found).chi2 == pytest.approx(9.0, rel=0.2)
 
 
