@@ -2,7 +2,7 @@
 
 import logging
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from schemas.results import CrossingResult
@@ -78,17 +78,25 @@ def pairs_without_validation(crossings: Iterable[CrossingResult]) -> list[Vehicl
     return pairs_with_intervals(one for one in crossings if one.certificate is None)
 
 
+Records = Mapping[VehicleBridgePair, ValidationRecord | None]
+"""Validation records of pairs, None of those without one."""
+
+
+def records_of(folder: Path, site: Site, pairs: Iterable[VehicleBridgePair]) -> Records:
+    """Return the records of pairs of a site. An unreadable one is a warning, and none."""
+    return {pair: _record_of(folder, site, pair) for pair in pairs}
+
+
 def validation_notes(
-    folder: Path, site: Site, pairs: Iterable[VehicleBridgePair], language: Language = ENGLISH
+    folder: Path, site: Site, records: Records, language: Language = ENGLISH
 ) -> Iterator[str]:
     """Yield a sentence for each pair of a bridge that failed, then one for all untried ones.
 
-    A pair whose record has passed since its identification has none. An unreadable record is a
-    warning.
+    A pair whose record has passed since its identification has none. `folder` is that of the
+    records.
     """
     untried = []
-    for pair in pairs:
-        record = _record_of(folder, site, pair)
+    for pair, record in records.items():
         if record is None:
             untried.append(pair.vehicle)
         elif not record.passed:
@@ -110,10 +118,9 @@ def validation_notes(
         yield language.text("caution.unvalidated", trucks=trucks, folder=folder.absolute().name)
 
 
-def has_failed_validation(folder: Path, site: Site, pairs: Iterable[VehicleBridgePair]) -> bool:
-    """Return whether the validation record of any of these pairs has failed."""
-    records = (_record_of(folder, site, pair) for pair in pairs)
-    return any(record is not None and not record.passed for record in records)
+def has_failed_validation(records: Records) -> bool:
+    """Return whether any of the records has failed."""
+    return any(record is not None and not record.passed for record in records.values())
 
 
 def frequent_reasons(tried: Iterable[ValidationCrossing], language: Language = ENGLISH) -> str:
@@ -125,12 +132,9 @@ def frequent_reasons(tried: Iterable[ValidationCrossing], language: Language = E
     return language.text("caution.validation_reasons", reasons=listed) if listed else ""
 
 
-def validations_passed(
-    folder: Path, site: Site, pairs: Iterable[VehicleBridgePair], language: Language = ENGLISH
-) -> Iterator[str]:
+def validations_passed(records: Records, language: Language = ENGLISH) -> Iterator[str]:
     """Yield a sentence for each pair whose validation record has passed."""
-    for pair in pairs:
-        record = _record_of(folder, site, pair)
+    for pair, record in records.items():
         if record is not None and record.passed:
             figures = record.figures
             yield language.text(
@@ -159,8 +163,10 @@ class ValidatedPairs:
 
     def notes(self, folder: Path, site: Site, bridge: str) -> Iterator[str]:
         """Yield the sentences on the pairs of a bridge: failed, untried, passed."""
-        yield from validation_notes(folder, site, sorted(self._unvalidated[bridge]))
-        yield from validations_passed(folder, site, sorted(self._pairs[bridge]))
+        records = records_of(folder, site, sorted(self._pairs[bridge]))
+        unvalidated = {pair: records[pair] for pair in sorted(self._unvalidated[bridge])}
+        yield from validation_notes(folder, site, unvalidated)
+        yield from validations_passed(records)
 
 
 def _record_of(folder: Path, site: Site, pair: VehicleBridgePair) -> ValidationRecord | None:

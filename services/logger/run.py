@@ -100,7 +100,7 @@ def run(asked: LoggerSettings, ready: Callable[[], None] | None = None) -> int:
         writer = FileWriter(place, limits, own=own)
         try:
             intake = Intake(place.realm, asked.service_id, own.boot_id)
-            logger = _Logger(place, realms, asked.service_id, writer, intake, own, asked)
+            logger = _Logger(place, realms, writer, intake, own, asked)
             with _rotated_by_signal(writer):
                 gone = _record(logger, bus, stop, ready, asked.budget_bytes)
         except BaseException:
@@ -131,7 +131,6 @@ def _check(asked: LoggerSettings, limits: RotationLimits) -> tuple[RecordingTarg
 class _Logger(NamedTuple):
     place: RecordingTarget
     realms: Sequence[str]
-    service_id: str
     writer: FileWriter
     intake: Intake
     own: OwnEvents
@@ -360,7 +359,7 @@ class _Announcements:
         for realm, message in by_realm.items():
             message.time_ns = time.time_ns()
             payload = message.SerializeToString(deterministic=True)
-            self._publisher(realm).put("service", self._logger.service_id, "durable", payload)
+            self._publisher(realm).put("service", self._logger.asked.service_id, "durable", payload)
         return version
 
     def _publish_health(self, *, ended: bool) -> None:
@@ -374,7 +373,7 @@ class _Announcements:
         message = pb.Health(
             schema_version=1,
             time_ns=time.time_ns(),
-            service=self._logger.service_id,
+            service=self._logger.asked.service_id,
             ok=writer.failure is None and not writer.dropped and not writer.room.is_low,
             figures={name: float(value) for name, value in figures.items()},
             note="; ".join(note for note in notes if note),
@@ -382,7 +381,7 @@ class _Announcements:
         )
         realm = self._logger.place.realm or "live"
         payload = message.SerializeToString(deterministic=True)
-        self._publisher(realm).put("service", self._logger.service_id, "health", payload)
+        self._publisher(realm).put("service", self._logger.asked.service_id, "health", payload)
         _log.info("%s", health_line(figures), extra={"figures": figures})
 
 

@@ -19,6 +19,7 @@ from services.history.validation_files import (
     has_failed_validation,
     pairs_with_intervals,
     pairs_without_validation,
+    records_of,
     validation_notes,
     validations_passed,
 )
@@ -154,10 +155,10 @@ def _report(
     view = view_of_bridge(bridge, merged, stored)
     used = tuple(crossing for crossing in crossings if crossing.crossing_id in view.used)
     combined = None if before is not None else combined_surveys(_survey_files(name, about), used)
-    pairs = pairs_without_validation(used)
-    notes = tuple(validation_notes(validations, site, pairs, language))
-    failed = has_failed_validation(validations, site, pairs)
-    passed = validations_passed(validations, site, pairs_with_intervals(used), language)
+    records = records_of(validations, site, pairs_with_intervals(used))
+    unvalidated = {pair: records[pair] for pair in pairs_without_validation(used)}
+    notes = tuple(validation_notes(validations, site, unvalidated, language))
+    passed = validations_passed(records, language)
     basis = CautionBasis(bridge, view, used, before, combined, notes)
     return BridgeReport(
         bridge,
@@ -168,7 +169,7 @@ def _report(
         last.created,
         site,
         before,
-        _finding(view, crossings, stored, language, has_failed=failed),
+        _finding(view, crossings, stored, language, has_failed=has_failed_validation(unvalidated)),
         " ".join((quality(view, crossings, language), *repeated(repeats, language), *passed)),
         tuple(cautions(basis, language)),
         not notes,

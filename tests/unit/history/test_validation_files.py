@@ -7,9 +7,10 @@ import pytest
 
 from schemas.site import Site
 from schemas.validation_records import VehicleBridgePair
-from services.common.language import language_of
+from services.common.language import ENGLISH, Language, language_of
 from services.history.validation_files import (
     pairs_without_validation,
+    records_of,
     save,
     validation_notes,
     validations_passed,
@@ -18,6 +19,18 @@ from tests.builders.certificates import certificate, tried
 from tests.unit.viewer.found import results_of, some_crossing
 
 PAIR = VehicleBridgePair("truck-1", "bridge-1")
+
+
+def notes_of(
+    folder: Path, site: Site, pairs: list[VehicleBridgePair], language: Language = ENGLISH
+) -> list[str]:
+    return list(validation_notes(folder, site, records_of(folder, site, pairs), language))
+
+
+def passed_of(
+    folder: Path, site: Site, pairs: list[VehicleBridgePair], language: Language = ENGLISH
+) -> list[str]:
+    return list(validations_passed(records_of(folder, site, pairs), language))
 
 
 def untried(folder: Path) -> str:
@@ -40,10 +53,10 @@ def test_pairs_are_those_of_intervals_without_a_record(site: Site) -> None:
 
 def test_untried_pairs_share_a_sentence(site: Site, tmp_path: Path) -> None:
     none = tmp_path / "none"
-    assert list(validation_notes(none, site, [PAIR])) == [untried(none)]
-    assert list(validation_notes(tmp_path, site, [])) == []
+    assert list(notes_of(none, site, [PAIR])) == [untried(none)]
+    assert list(notes_of(tmp_path, site, [])) == []
     both = [PAIR, VehicleBridgePair("truck-2", "bridge-1")]  # the second is not of the site
-    (line,) = validation_notes(tmp_path, site, both)
+    (line,) = notes_of(tmp_path, site, both)
     assert "of truck-1 and truck-2 on this bridge" in line
 
 
@@ -53,7 +66,7 @@ def test_relative_folder_is_named_as_a_whole(
     """It depends on the working folder, where a report may be made elsewhere than the record."""
     monkeypatch.chdir(tmp_path)
     folder = Path("recordings/certificates")
-    assert list(validation_notes(folder, site, [PAIR])) == [untried(tmp_path / folder)]
+    assert list(notes_of(folder, site, [PAIR])) == [untried(tmp_path / folder)]
 
 
 def test_record_of_the_pair_decides(site: Site, tmp_path: Path) -> None:
@@ -62,17 +75,17 @@ def test_record_of_the_pair_decides(site: Site, tmp_path: Path) -> None:
         update={"crossings": 12, "good": 12, "intervals": 60, "covered": 49}
     )
     save(tmp_path, certificate(site, passed=False, figures=failed.model_dump()))
-    (line,) = validation_notes(tmp_path, site, [PAIR])
+    (line,) = notes_of(tmp_path, site, [PAIR])
     assert line == (
         "Site validation of truck-1 on this bridge FAILED: 12 of 12 simulated crossings were good, "
         "49 of 60 intervals contained the truth (at least 85 % must). Do not rely on the "
         "intervals: check the site file, try fewer elements or a truck with equal single tyres or "
         "an equalised tandem, and validate again."
     )
-    (german,) = validation_notes(tmp_path, site, [PAIR], language_of("de"))
+    (german,) = notes_of(tmp_path, site, [PAIR], language_of("de"))
     assert "NICHT bestanden: 12 von 12 simulierten Überfahrten" in german
     save(tmp_path, certificate(site))
-    assert list(validation_notes(tmp_path, site, [PAIR])) == []
+    assert list(notes_of(tmp_path, site, [PAIR])) == []
 
 
 def test_failed_record_names_the_usual_reasons_in_words(site: Site, tmp_path: Path) -> None:
@@ -82,12 +95,12 @@ def test_failed_record_names_the_usual_reasons_in_words(site: Site, tmp_path: Pa
     crossings = [tried(4), tried(5, verdict="suspect", reasons=("not_converged",))]
     crossings += [tried(n, verdict="rejected", reasons=why, **none) for n, why in enumerate(codes)]
     save(tmp_path, certificate(site, passed=False, crossings=crossings))
-    (line,) = validation_notes(tmp_path, site, [PAIR])
+    (line,) = notes_of(tmp_path, site, [PAIR])
     assert line.endswith(
         "and validate again. Most frequent reasons of crossings that were not good: The search did "
         "not converge (3); The model does not explain the measured accelerations (2)."
     )
-    (german,) = validation_notes(tmp_path, site, [PAIR], language_of("de"))
+    (german,) = notes_of(tmp_path, site, [PAIR], language_of("de"))
     assert german.endswith(
         "die nicht gut waren: Die Suche ist nicht konvergiert (3); Das Modell erklärt die "
         "gemessenen Beschleunigungen nicht (2)."
@@ -97,28 +110,28 @@ def test_failed_record_names_the_usual_reasons_in_words(site: Site, tmp_path: Pa
 def test_passed_record_states_the_fewest_intervals_that_pass(site: Site, tmp_path: Path) -> None:
     figures = certificate(site).figures.model_copy(update={"intervals": 55, "covered": 48})
     save(tmp_path, certificate(site, figures=figures.model_dump()))
-    (line,) = validations_passed(tmp_path, site, [PAIR])
+    (line,) = passed_of(tmp_path, site, [PAIR])
     assert line == (
         "Site validation of truck-1: passed; 48 of 55 intervals of simulated crossings contained "
         "the truth (at least 47 must)."
     )
-    (german,) = validations_passed(tmp_path, site, [PAIR], language_of("de"))
+    (german,) = passed_of(tmp_path, site, [PAIR], language_of("de"))
     assert "48 von 55 Intervallen" in german
     assert "(mindestens 47 müssen es)" in german
     other = VehicleBridgePair("truck-2", "bridge-1")
-    assert list(validations_passed(tmp_path, site, [other])) == []
+    assert list(passed_of(tmp_path, site, [other])) == []
 
 
 def test_record_of_another_truck_counts_for_nothing(site: Site, tmp_path: Path) -> None:
     save(tmp_path, certificate(site))
     heavier = site.vehicles[0].model_copy(update={"total_mass_kg": 9999.0})
     changed = site.model_copy(update={"vehicles": (heavier,)})
-    assert list(validation_notes(tmp_path, changed, [PAIR])) == [untried(tmp_path)]
+    assert list(notes_of(tmp_path, changed, [PAIR])) == [untried(tmp_path)]
 
 
 def test_unreadable_record_is_a_warning(
     site: Site, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     save(tmp_path, certificate(site)).write_text("{")
-    assert list(validation_notes(tmp_path, site, [PAIR])) == [untried(tmp_path)]
+    assert list(notes_of(tmp_path, site, [PAIR])) == [untried(tmp_path)]
     assert len(caplog.records) == 1
