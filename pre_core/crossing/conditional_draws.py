@@ -23,9 +23,15 @@ from scipy.linalg import cho_solve, solve_triangular
 from pre_core.arrays import FloatArray
 from pre_core.crossing import compliances, posterior
 from pre_core.crossing.fit import Optimum
-from pre_core.crossing.nuisances import place_of_offset
+from pre_core.crossing.nuisances import moved, place_of_offset, swing_effects
 from pre_core.crossing.posterior import PosteriorProblem
-from pre_core.crossing.residual_draws import CompletedDraws, DrawnDensity, residual_draws
+from pre_core.crossing.residual_draws import (
+    CompletedDraws,
+    DrawnDensity,
+    prior_centres,
+    prior_squares,
+    residual_draws,
+)
 from pre_core.crossing.weighted_draws import WeightedDraws
 from pre_core.search.loop import Report
 
@@ -82,10 +88,10 @@ def conditional_draws(
     n = of.kept.size
     count = round(_POINTS_PER_TERM * (n + 1) * (n + 2) / 2)
     first = compliances.present_points(found, count, _WIDER * inflation, seed)[:, of.kept]
-    at_optimum = _log_determinant(of, of.y[None, of.kept])
+    at_optimum = _points(of, of.y[None, of.kept]).integrated[0].log_determinant
     density = DrawnDensity(
         partial(_residuals, of, at_optimum),
-        partial(_prior_squares, _prior_centres(of)),
+        partial(prior_squares, prior_centres(found, of.kept[:-1])),
         np.searchsorted(of.kept[:-1], posterior.layout(of.problem).half_normal),
         posterior.log_odds_of_absence(of.problem, inflation)[of.kept],
         inflation,
@@ -136,40 +142,6 @@ def _partition(found: Optimum, inflation: float) -> _Partition:
     )
 
 
-def _prior_centres(of: _Partition) -> FloatArray:
-    """Return the centres (n,) of the priors of the kept coordinates (`posterior.all_rows`)."""
-    return np.asarray(np.pad(of.problem.noise_slope, (0, of.y.size))[of.kept[:-1]])
-
-
-def _prior_squares(centres: FloatArray, drawn: FloatArray) -> FloatArray:
-    """Return the squares (k,) of the priors at points (k, n + 1), the offset without any."""
-    return np.asarray(np.sum((drawn[:, :-1] - centres) ** 2, axis=1))
-
-
-def _followed(of: _Partition, drawn: FloatArray) -> FloatArray:
-    """Return points y (k, f) whose linear coordinates follow points (k, n + 1); no vibration."""
-    moves = drawn - of.y[of.kept]
-    points = np.repeat(of.y[None, :], drawn.shape[0], axis=0)
-    points[:, posterior.layout(of.problem).trajectory] += moves[:, -1:]
-    points[:, of.kept[:-1]] = drawn[:, :-1]
-    points[:, of.linear] += moves @ of.follow.T
-    return points
-
-
-def _rows(of: _Partition, points: FloatArray) -> FloatArray:
-    return np.asarray(posterior.all_rows(of.problem, points)[:, of.rows])
-
-
-def _waves(of: _Partition, points: FloatArray, residuals: FloatArray) -> FloatArray:
-    """Return the effects (k, m, w) of the vibration at points (k, f) with these residuals."""
-    waves = np.empty((*residuals.shape, of.swing.size))
-    for number, place in enumerate(of.swing):
-        moved = points.copy()
-        moved[:, place] += 1.0
-        waves[:, :, number] = _rows(of, moved) - residuals
-    return waves
-
-
 def _integrated(of: _Partition, residual: FloatArray, waves: FloatArray) -> _Integrated:
     """Integrate the linear coordinates out of the residuals (m,) of one point.
 
@@ -187,52 +159,57 @@ def _integrated(of: _Partition, residual: FloatArray, waves: FloatArray) -> _Int
     )
 
 
-def _log_determinant(of: _Partition, drawn: FloatArray) -> float:
-    points = _followed(of, drawn)
-    residuals = _rows(of, points)
-    return _integrated(of, residuals[0], _waves(of, points, residuals)[0]).log_determinant
+class _IntegratedPoints(NamedTuple):
+    """Points with their residuals; `integrated` where these are finite."""
+
+    y: FloatArray  # (k, f) whose linear coordinates follow, without vibration
+    residuals: FloatArray  # (k, m)
+    waves: FloatArray  # (k, m, w) effects of the vibration
+    integrated: dict[int, _Integrated]
 
 
-def _with_determinant(of: _Partition, one: _Integrated, at_optimum: float) -> FloatArray:
-    """Return the residuals (m + 1,) whose squares include the determinant."""
-    excess = of.inflation**2 * (one.log_determinant - at_optimum)
-    return np.append(one.residual, np.sqrt(max(_LEVEL**2 + excess, 0.0)))
+def _points(of: _Partition, drawn: FloatArray) -> _IntegratedPoints:
+    """Return the points at kept coordinates (k, n + 1)."""
+    y, moves = moved(of.problem, of.y, of.kept, drawn)
+    y[:, of.linear] += moves @ of.follow.T
+    residuals, effects = swing_effects(of.problem, y, of.rows)
+    waves = np.moveaxis(effects, 0, 2)
+    are_finite = np.isfinite(residuals).all(axis=1) & np.isfinite(waves).all(axis=(1, 2))
+    integrated = {
+        int(k): _integrated(of, residuals[k], waves[k]) for k in np.flatnonzero(are_finite)
+    }
+    return _IntegratedPoints(y, residuals, waves, integrated)
+
+
+def _with_determinant(of: _Partition, at_optimum: float, points: _IntegratedPoints) -> FloatArray:
+    """Return residuals (m + 1, k) whose squares include the determinant."""
+    out = np.full((of.rows.size + 1, points.y.shape[0]), np.nan)
+    for k, one in points.integrated.items():
+        excess = of.inflation**2 * (one.log_determinant - at_optimum)
+        out[:, k] = np.append(one.residual, np.sqrt(max(_LEVEL**2 + excess, 0.0)))
+    return out
 
 
 def _residuals(of: _Partition, at_optimum: float, drawn: FloatArray) -> FloatArray:
     """Return residuals (m + 1, k) at points (k, n + 1), all other coordinates integrated out."""
-    points = _followed(of, drawn)
-    residuals = _rows(of, points)
-    waves = _waves(of, points, residuals)
-    out = np.full((of.rows.size + 1, drawn.shape[0]), np.nan)
-    for k in np.flatnonzero(_are_finite(residuals, waves)):
-        out[:, k] = _with_determinant(of, _integrated(of, residuals[k], waves[k]), at_optimum)
-    return out
+    return _with_determinant(of, at_optimum, _points(of, drawn))
 
 
 def _completed(
     of: _Partition, at_optimum: float, rng: np.random.Generator, drawn: FloatArray
 ) -> CompletedDraws:
     """Return draws (k, n + 1) with all linear coordinates drawn given these."""
-    points = _followed(of, drawn)
-    residuals = _rows(of, points)
-    waves = _waves(of, points, residuals)
-    out = np.full((of.rows.size + 1, drawn.shape[0]), np.nan)
-    squares = np.full(drawn.shape[0], np.nan)
+    points = _points(of, drawn)
+    y, squares = points.y, np.full(drawn.shape[0], np.nan)
     normal = rng.standard_normal((drawn.shape[0], of.swing.size + of.linear.size))
-    for k in np.flatnonzero(_are_finite(residuals, waves)):
-        one = _integrated(of, residuals[k], waves[k])
+    for k, one in points.integrated.items():
         of_swing, of_linear = np.split(normal[k], [of.swing.size])
         swing = one.swing + of.inflation * solve_triangular(one.root, of_swing)
-        left = of.effects.T @ (residuals[k] + waves[k] @ swing)
+        left = of.effects.T @ (points.residuals[k] + points.waves[k] @ swing)
         linear = of.inflation * solve_triangular(of.root, of_linear)
-        points[k, of.swing] = swing
-        points[k, of.linear] += linear - cho_solve((of.root, False), left)
-        out[:, k] = _with_determinant(of, one, at_optimum)
+        y[k, of.swing] = swing
+        y[k, of.linear] += linear - cho_solve((of.root, False), left)
         # The density of the completion: its determinant, and the squares of its normal.
         squares[k] = of.inflation**2 * (one.log_determinant - normal[k] @ normal[k])
-    return CompletedDraws(out, points, squares + np.sum(_rows(of, points) ** 2, axis=1))
-
-
-def _are_finite(residuals: FloatArray, waves: FloatArray) -> NDArray[np.bool_]:
-    return np.asarray(np.isfinite(residuals).all(axis=1) & np.isfinite(waves).all(axis=(1, 2)))
+    squares += np.sum(posterior.all_rows(of.problem, y)[:, of.rows] ** 2, axis=1)
+    return CompletedDraws(_with_determinant(of, at_optimum, points), y, squares)

@@ -166,16 +166,26 @@ def followed(of: Nuisances, drawn: FloatArray, *, has_step: bool) -> FloatArray:
 
     Each takes an evaluation if it `has_step` of its own.
     """
-    where, parts = posterior.layout(of.problem), of.parts
-    moves = drawn - of.y[of.kept]
-    points = np.repeat(of.y[None, :], drawn.shape[0], axis=0)
-    points[:, parts.curved] = drawn[:, :-1]
-    points[:, where.trajectory] += moves[:, -1:]
+    points, moves = moved(of.problem, of.y, of.kept, drawn)
     points[:, of.own] += moves @ of.of_own.T
-    points[:, parts.linear] += moves @ of.of_linear.T
+    points[:, of.parts.linear] += moves @ of.of_linear.T
     if has_step:
         points[:, of.own] += (of.step @ _residuals(of, points)).T
     return points
+
+
+def moved(
+    problem: PosteriorProblem, y: FloatArray, kept: NDArray[np.int64], drawn: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return points (k, f) with y (f,) at `kept` coordinates (k, n + 1), and the moves of these.
+
+    The offset is last, and moves the whole trajectory.
+    """
+    moves = drawn - y[kept]
+    points = np.repeat(y[None, :], drawn.shape[0], axis=0)
+    points[:, kept[:-1]] = drawn[:, :-1]
+    points[:, posterior.layout(problem).trajectory] += moves[:, -1:]
+    return points, moves
 
 
 def _residuals(of: Nuisances, points: FloatArray) -> FloatArray:
@@ -187,17 +197,25 @@ def _swing_waves(
     problem: PosteriorProblem, points: FloatArray, rows: NDArray[np.int64]
 ) -> FloatArray:
     """Return waves (m, r) whose covariance is that of the initial vibration at points (n, f)."""
-    swing = posterior.layout(problem).swing
-    residuals = posterior.all_rows(problem, points)[:, rows]
-    waves = []
-    for place in range(swing.start, swing.stop):
-        swinging = points.copy()
-        swinging[:, place] += 1.0
-        waves.append(posterior.all_rows(problem, swinging)[:, rows] - residuals)
+    _, waves = swing_effects(problem, points, rows)
     directions, spread, _ = np.linalg.svd(np.concatenate(waves).T, full_matrices=False)
     spread /= np.sqrt(points.shape[0])
     clear = int((spread > _LEAST_WAVE).sum())
     return np.asarray(directions[:, :clear] * spread[:clear])
+
+
+def swing_effects(
+    problem: PosteriorProblem, points: FloatArray, rows: NDArray[np.int64]
+) -> tuple[FloatArray, FloatArray]:
+    """Return residuals (k, m) at points (k, f), and the initial vibration's effects (w, k, m)."""
+    swing = posterior.layout(problem).swing
+    residuals = posterior.all_rows(problem, points)[:, rows]
+    effects = []
+    for place in range(swing.start, swing.stop):
+        swinging = points.copy()
+        swinging[:, place] += 1.0
+        effects.append(posterior.all_rows(problem, swinging)[:, rows] - residuals)
+    return residuals, np.stack(effects)
 
 
 def _steps(

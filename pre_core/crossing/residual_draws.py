@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from pre_core.arrays import FloatArray
+from pre_core.crossing.fit import Optimum
 from pre_core.crossing.response_surface import (
     ParabolaSums,
     added,
@@ -150,6 +151,17 @@ def _drawn(density: DrawnDensity, frame: _Frame, y: FloatArray) -> _Points:
         squares=np.nan_to_num(squares, nan=_IMPOSSIBLE**2, posinf=_IMPOSSIBLE**2),
         completed=np.concatenate([one.y for one in found]),
     )
+
+
+def prior_centres(found: Optimum, coordinates: NDArray[np.int64]) -> FloatArray:
+    """Return the centres (n,) of the priors of coordinates (n,) (`posterior.all_rows`)."""
+    centres = np.pad(found.problem.noise_slope, (0, found.state.y.size))
+    return np.asarray(centres[coordinates])
+
+
+def prior_squares(centres: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the squares (k,) of the priors at points y (k, n + 1), the offset without any."""
+    return np.asarray(np.sum((y[:, :-1] - centres) ** 2, axis=1))
 
 
 def log_density(density: DrawnDensity, y: FloatArray, squares: FloatArray) -> FloatArray:

@@ -123,24 +123,29 @@ def without_torsion(found: Optimum, place: int) -> Optimum:
 def _single_profile_draws(
     found: Optimum, draws: int, seed: int, inflation: float, report: Report
 ) -> PosteriorDraws:
-    problem = found.problem
-
-    def target(points: FloatArray) -> FloatArray:
-        rows = posterior.all_rows(problem, points)
-        return np.asarray(-0.5 / inflation**2 * np.sum(rows * rows, axis=1))
-
-    coordinates = surrogate.coordinates(found, inflation)
-    first = surrogate.gauss_newton_surrogate(found, coordinates)
-    start, monitored = found.state.y, _monitored_indices(problem)
-    wanted = WantedDraws(draws, _PATIENCE)
-    weighted = importance_draws(target, coordinates, first, start, wanted, seed, report)
+    weighted = surrogate_draws(found, draws, seed, inflation, report)
     evaluations = weighted.y.shape[0]
     if not is_enough(weighted.worth, draws):
         other = conditional_draws(found, draws, seed, inflation, report)
         evaluations += other.evaluations
         weighted = max(weighted, other.weighted, key=lambda one: one.worth.ess)
-    chains = _resample_to_chains(weighted, monitored, draws, seed)
+    chains = _resample_to_chains(weighted, _monitored_indices(found.problem), draws, seed)
     return chains._replace(evaluations=evaluations)
+
+
+def surrogate_draws(
+    found: Optimum, draws: int, seed: int, inflation: float, report: Report
+) -> WeightedDraws:
+    """Return weighted draws (k, f) of all coordinates at once, as long as they are on course."""
+
+    def target(points: FloatArray) -> FloatArray:
+        rows = posterior.all_rows(found.problem, points)
+        return np.asarray(-0.5 / inflation**2 * np.sum(rows * rows, axis=1))
+
+    coordinates = surrogate.coordinates(found, inflation)
+    first = surrogate.gauss_newton_surrogate(found, coordinates)
+    wanted = WantedDraws(draws, _PATIENCE)
+    return importance_draws(target, coordinates, first, found.state.y, wanted, seed, report)
 
 
 def _resample_to_chains(

@@ -29,7 +29,13 @@ from pre_core.crossing.nuisances import (
     nuisances_of,
     place_of_offset,
 )
-from pre_core.crossing.residual_draws import DrawnDensity, log_density, residual_draws
+from pre_core.crossing.residual_draws import (
+    DrawnDensity,
+    log_density,
+    prior_centres,
+    prior_squares,
+    residual_draws,
+)
 from pre_core.crossing.response_surface import (
     POINTS,
     POINTS_OF_DRAWS,
@@ -107,7 +113,7 @@ def drawn_by_residuals(
     odds = posterior.log_odds_of_absence(found.problem, inflation)[nuisances.kept]
     density = DrawnDensity(
         partial(integrated_residuals, nuisances, has_step=True),
-        partial(_prior_squares, _prior_centres(found)),
+        partial(prior_squares, prior_centres(found, curved)),
         half_normal,
         odds,
         inflation,
@@ -137,17 +143,6 @@ def _likely_rivals(
     rows = partial(posterior.all_rows, found.problem)
     likely = [found._replace(state=initial_state(rows, y)) for y in points]
     return likely, 2 * len(drawn) + len(likely) * (found.state.y.size + 2)
-
-
-def _prior_centres(found: Optimum) -> FloatArray:
-    """Return the centres (n,) of the curved coordinates' priors (`posterior.all_rows`)."""
-    centres = np.pad(found.problem.noise_slope, (0, found.state.y.size))
-    return np.asarray(centres[curved_coordinates(found)])
-
-
-def _prior_squares(centres: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the squares (k,) of the priors of curved coordinates at points y (k, n + 1)."""
-    return np.asarray(np.sum((y[:, :-1] - centres) ** 2, axis=1))
 
 
 def curved_coordinates(found: Optimum) -> NDArray[np.int64]:
@@ -225,10 +220,10 @@ def draw_curved(
     all draws.
     """
     kept = np.append(curved_coordinates(found), place_of_offset(found.problem))
-    centres = _prior_centres(found)
+    centres = prior_centres(found, kept[:-1])
 
     def target(y: FloatArray) -> FloatArray:
-        return np.asarray(-0.5 / inflation**2 * (squares(y) + _prior_squares(centres, y)))
+        return np.asarray(-0.5 / inflation**2 * (squares(y) + prior_squares(centres, y)))
 
     full = surrogate.coordinates(found, inflation)
     coordinates = surrogate.restricted(full, kept)

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from pre_core.arrays import FloatArray
-from pre_core.crossing import posterior, sampling, surrogate
+from pre_core.crossing import posterior, sampling
 from pre_core.crossing.conditional_draws import conditional_draws
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.optimum import find_optimum
 from pre_core.crossing.weighted_draws import (
     WantedDraws,
     WeightedDraws,
-    importance_draws,
     is_enough,
 )
 from pre_core.search.importance import SmoothedWeights
@@ -54,20 +53,12 @@ def moments(drawn: WeightedDraws) -> Moments:
 @pytest.mark.parametrize("inflation", [1.0, 2.0])
 def test_both_ways_draw_the_same_posterior(found: Optimum, inflation: float) -> None:
     """They share the residuals, and neither the density of the draws nor its coordinates."""
-    problem = found.problem
-
-    def target(points: FloatArray) -> FloatArray:
-        rows = posterior.all_rows(problem, points)
-        return np.asarray(-0.5 / inflation**2 * np.sum(rows * rows, axis=1))
-
-    of = surrogate.coordinates(found, inflation)
-    near = surrogate.gauss_newton_surrogate(found, of)
-    all_at_once = importance_draws(target, of, near, found.state.y, WantedDraws(DRAWS), 2, silent)
+    all_at_once = sampling.surrogate_draws(found, DRAWS, 2, inflation, silent)
     some = conditional_draws(found, DRAWS, 2, inflation, silent)
     assert is_enough(all_at_once.worth, DRAWS)
     assert is_enough(some.weighted.worth, DRAWS)
     expected, seen = moments(all_at_once), moments(some.weighted)
-    where = posterior.layout(problem)
+    where = posterior.layout(found.problem)
     normal = np.setdiff1d(np.arange(where.size), where.half_normal)
     z = (seen.mean - expected.mean)[normal] / expected.spread[normal]
     assert np.abs(z[np.isin(normal, where.elements)]).max() < 0.4
