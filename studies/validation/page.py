@@ -114,8 +114,8 @@ effect is added, or all but surface, torsion, left-and-right and pavement, which
 own (`studies/simulation/out_of_model.py` explains the effects and gives their ranges, none of which
 is a prior of the method). `answered` crossings are not rejected; `covered` is the share of the 95 %
 intervals of EI that contain the truth, in answered crossings and in good ones (`of good`). z is
-here the error of EI, not of ln EI, over its standard deviation: its mean over all elements and that
-of the worst element, its root mean square (`rms`), and its largest size in good crossings (`max`).
+the error of ln EI, as above: its mean over all elements and that of the worst element, its root
+mean square (`rms`), and its largest size in good crossings (`max`).
 `std` is the median relative standard deviation of EI, for the surface also over its
 bound (`of bound`).
 

@@ -293,14 +293,14 @@ def test_an_effect_that_is_none() -> None:
 
 
 def made_up(effect: str, seed: int, z: tuple[float, ...], verdict: str = "good") -> dict[str, Any]:
-    """A record whose errors are so many standard deviations of 5 %."""
+    """A record whose errors of ln EI are so many standard deviations of 5 %."""
     truth = {f"EI_{e + 1}": 1e10 for e in range(len(z))}
     estimates = {
         name: {
-            "mean": 1e10 + 5e8 * error,
             "std": 5e8,
-            "q025": 1e10 + 5e8 * (error - 1.96),
-            "q975": 1e10 + 5e8 * (error + 1.96),
+            "q025": 1e10 * np.exp(0.05 * (error - 1.959964)),
+            "q50": 1e10 * np.exp(0.05 * error),
+            "q975": 1e10 * np.exp(0.05 * (error + 1.959964)),
         }
         for name, error in zip(truth, z, strict=True)
     }
