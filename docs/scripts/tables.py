@@ -147,10 +147,10 @@ def _needed(needs: ListedCommand) -> str:
 
 
 _FOR = {
-    "none": "the bus, recordings, import and export of CSV, credentials",
-    "identify": "compute: identify, simulate, check, plan, fuse, compare",
+    "none": "bus, recordings, CSV import and export, credentials",
+    "identify": "computation: identify, simulate, check, plan, fuse, compare",
     "view": "the Rerun viewer and its files, pictures, reports",
-    "history": "results over years, alarms, catalogues, Parquet; folders through fsspec",
+    "history": "results over years, alarms, catalogues, Parquet; remote folders through fsspec",
     "ros2": "recordings of ROS 2 and the gateway",
     "s3": "addresses such as s3://bucket/fleet, with `history`",
     "cluster": "a Dask cluster, with `identify`",
