@@ -39,7 +39,10 @@ class IdentifyOptions:
     json: Path | None = output_option("JSON file of the results", "OUT.json", RESULTS)
     rrd: Path | None = output_option("Rerun file of the results", "OUT.rrd", RERUN)
     draws: Path | None = output_option(
-        "file of the posterior draws of method pre, for ArviZ", "OUT.npz|OUT.nc", ARRAYS, NETCDF
+        "file of the posterior draws of method pre (.nc: for ArviZ)",
+        "OUT.npz|OUT.nc",
+        ARRAYS,
+        NETCDF,
     )
     figures: Path | None = output_folder_option(
         "folder for figures of every crossing and bridge, as PNG and SVG"

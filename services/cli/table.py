@@ -71,7 +71,7 @@ COMMANDS: Final[Mapping[str, ListedCommand]] = {
         {"history": ("identify", "history")},
     ),
     "validate": ListedCommand(
-        "identify simulated crossings and compare them with the truth and the paper",
+        "identify simulated crossings and compare results with the truth and the paper",
         _IDENTIFY,
         {"figures": _VIEW},
     ),

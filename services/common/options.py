@@ -173,7 +173,8 @@ def id_option(default: str) -> Any:
 
 def noise_option(text: str, default: float | None = 0.0) -> Any:
     """Return `--noise` of the accelerometers."""
-    return opt(text, number("a noise density", low=0, high=1e6), default=default)
+    parse = number("a noise density", low=0, high=1e6)
+    return opt(text, parse, default=default, metavar="UG_PER_RTHZ")
 
 
 def seed_option() -> Any:

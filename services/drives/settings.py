@@ -33,9 +33,11 @@ class ImportOptions:
     site: Path = site_option(
         "site file of truck and bridges; stored in the recording", required=True
     )
-    vehicle: str | None = opt("identifier of the site's vehicle that drove", metavar="ID")
+    vehicle: str | None = opt(
+        "identifier of the site's vehicle that drove, needed if there are several", metavar="ID"
+    )
     realm: str | None = opt(
-        "name in the realm import-NAME, which the drives of one campaign share (default: name in "
+        "NAME of the realm import-NAME, which the drives of one campaign share (default: name in "
         "[import] of the site file, else drives)",
         metavar="NAME",
     )
@@ -50,7 +52,7 @@ class ImportOptions:
         group=_TABLES,
     )
     write_map: Path | None = output_option(
-        "file to write the guessed map to, for --map", "MAP.toml", IMPORT_MAP, group=_TABLES
+        "file for the guessed column map, to read with --map", "MAP.toml", IMPORT_MAP, group=_TABLES
     )
     map: Path | None = file_option(
         "column map (files, columns, units, times) to read the tables with",

@@ -28,7 +28,9 @@ class LoggerSettings:
     """Settings of one run of the logger."""
 
     config: Path | None = config_option()
-    listen: str | None = opt(f"address to listen on (default: {DEFAULT_ENDPOINT})")
+    listen: str | None = opt(
+        f"address to listen on (default: {DEFAULT_ENDPOINT})", metavar="ENDPOINT"
+    )
     tls: Path | None = tls_option()
     insecure: bool = flag(
         "accept other machines without --tls; any session that reaches the address is accepted"

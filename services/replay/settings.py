@@ -36,7 +36,7 @@ class ReplaySettings(OnTheBus):
     )
     endpoint: str | None = endpoint_option()
     tls: Path | None = tls_option()
-    name: str | None = opt("NAME in the realm replay-NAME (default: name of the first recording)")
+    name: str | None = opt("NAME of the realm replay-NAME (default: name of the first recording)")
     site: Path | None = site_option(
         "site file of the bridges, for jumps to crossings (default: that of the recording)"
     )

@@ -56,14 +56,14 @@ class SimulateOptions:
     )
     site: Path | None = site_option("site file (default: truck and bridge of the paper)")
     vehicle: str | None = opt(
-        "identifier of the site's vehicle that drives (default: its first)", metavar="ID"
+        "identifier of the vehicle to simulate (default: the site's first)", metavar="ID"
     )
     bridge: str | None = opt(
-        "identifier of the site's bridge that it crosses (default: its first)", metavar="ID"
+        "identifier of the bridge to cross (default: the site's first)", metavar="ID"
     )
     axles: int | None = opt(
-        "axles of the truck; 3: a loaded tipper with an equalised tandem, unless the site's "
-        "truck has one (default: the site's truck, or 2)",
+        "number of axles of the truck; 3: a loaded tipper with an equalised tandem, unless the "
+        "site's truck has one (default: the site's truck, or 2)",
         int,
         choices=(2, 3),
     )
@@ -99,12 +99,14 @@ class SimulateOptions:
         whole("a number of runs", 1, 100),
         group=_RUNS,
         default=1,
+        metavar="N",
     )
     days: int = opt(
         "number of days, each with these runs, in one recording (default: 1)",
         whole("a number of days", 1, 1000),
         group=_RUNS,
         default=1,
+        metavar="N",
     )
     start: str | None = opt(
         "start of the first run, ISO 8601 with a zone (default: 2026-01-01T00:00:00Z)",
@@ -112,7 +114,7 @@ class SimulateOptions:
         metavar="TIME",
     )
     drive_seed: int | None = opt(
-        "seed of noise and lateral position (default: --seed, which also seeds the road)",
+        "seed of noise and lateral position (default: --seed; the road always uses --seed)",
         whole("a seed", 0),
         group=_SURFACE,
         metavar="SEED",

@@ -37,7 +37,7 @@ class ViewSettings(OnTheBus):
         "site file of the bridges (without it results are shown, but no plan)", group=_LIVE
     )
     serve: bool = flag(
-        "serve only; viewers that connect later receive the buffered history", group=_LIVE
+        "open no viewer; viewers that connect receive the buffered history", group=_LIVE
     )
     listen: str = opt(
         f"address for viewers (default: {LOOPBACK}, this machine only)",

@@ -42,6 +42,7 @@ class AlarmOptions(OnTheBus):
     what: str = positional(
         "detect changes, list alarms, acknowledge one (ack BRIDGE), or check and publish regularly",
         choices=_WHAT,
+        metavar=f"{{{','.join(_WHAT)}}}",
     )
     bridge: str | None = positional("bridge whose alarm is acknowledged", nargs="?")
     history: Path = history_option()
@@ -72,8 +73,10 @@ class AlarmOptions(OnTheBus):
         default=5.0,
         metavar="PERCENT",
     )
-    all: bool = flag("check all bridges again")
-    processes: int = opt("number of processes (default: 1)", whole("a number", 1, 256), default=1)
+    all: bool = flag("check all bridges, not only those with new crossings or periods")
+    processes: int = opt(
+        "number of processes (default: 1)", whole("a number", 1, 256), default=1, metavar="N"
+    )
     every: float = opt(
         "with serve: minutes between two checks (default: 60)",
         number("minutes", low=0.01, high=1e5),

@@ -28,7 +28,9 @@ class CatalogOptions:
     verify: bool = flag(
         "read every recording and compare it with its catalogue row, even where size and time agree"
     )
-    site: Path | None = site_option("list crossings of its bridges, from positions alone")
+    site: Path | None = site_option(
+        "site file whose bridges' crossings are listed, from positions alone"
+    )
     csv: Path | None = output_option(
         "CSV file of all crossings (with --site) or recordings; times are Unix times in s",
         "OUT.csv",

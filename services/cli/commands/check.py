@@ -19,7 +19,7 @@ class CheckOptions:
 
     paths: tuple[Path, ...] = positional(
         "a site file (default: the recordings' own), and recordings or folders of CSV "
-        "files: a minute of standstill, or any drive",
+        "files: a minute at standstill, or any drive",
         Path,
         nargs="*",
         metavar="SITE.toml|REC.mcap|DIR",
@@ -63,7 +63,7 @@ def _check(options: CheckOptions) -> int:
         if path.suffix == ".toml":
             _raise_on_faults(path, wants_json=options.json)
     recordings = [path for path in options.paths if path.suffix != ".toml"]
-    with reading_bar("looking", recordings) as next_file:
+    with reading_bar("checking", recordings) as next_file:
         found = list(inspect(options.paths, next_file))
     is_wrong = any(report.is_wrong for report in found)
     if options.json:
@@ -79,7 +79,7 @@ def _check(options: CheckOptions) -> int:
     print(
         f"{wrong} wrong, {left_open} open"
         if wrong or left_open
-        else "no finding speaks against a survey: driveby survey shows what it would detect"
+        else "nothing is wrong or open: driveby survey forecasts what a survey would detect"
     )
     return int(is_wrong)
 

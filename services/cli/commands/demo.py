@@ -13,7 +13,9 @@ from services.common.options import flag, noise_option, output_folder_option, sp
 class DemoOptions:
     """Options of `driveby demo`: how it runs, and the folder that it writes."""
 
-    out: Path | None = output_folder_option("new folder for the outputs")
+    out: Path | None = output_folder_option(
+        "new folder for the outputs (default: recordings/demo-TIME)"
+    )
     speed: float = speed_option(4.0)
     noise: float = noise_option(
         "accelerometers' noise density in µg/√Hz; 0: exact sensors and method least-squares "

@@ -51,7 +51,7 @@ class HistoryOptions:
         choices=("day", "week", "month"),
     )
     site: Path | None = site_option(
-        "site file with the baseline to which figures relate EI (default: the first period)"
+        "site file that names the figures' baseline (without it: the first period)"
     )
     temperature: Path | None = file_option(
         "with add: CSV file of temperatures (time_s,temperature_deg_c[,bridge])", "T.csv"

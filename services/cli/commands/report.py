@@ -37,13 +37,13 @@ class ReportOptions:
         flags=("-o", "--output"),
         default=Path("report.html"),
     )
-    pdf: bool = flag("also print it to OUT.pdf with an installed browser")
+    pdf: bool = flag("also print the report to OUT.pdf with an installed browser")
     site: Path | None = site_option(
         "site file of the bridges (default: that of a recording in the results' folder)"
     )
     baseline: Path | None = file_option(
-        "earlier results to show next to these, with the change (default: those of the site file)",
-        "BEFORE.json",
+        "earlier results to compare these with (default: those that the site file names)",
+        "OLD.json",
     )
     validations: Path | None = validations_option(
         f"folder of validation records (default: {CERTIFICATES})"

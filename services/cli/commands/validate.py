@@ -97,11 +97,13 @@ class ValidateOptions:
         "number of particles of the paper's random-walk search (default: 500)",
         whole("particles", 1),
         default=500,
+        metavar="N",
     )
     steps: int = opt(
         "number of steps of the paper's random-walk search (default: 600)",
         whole("steps", 1),
         default=600,
+        metavar="N",
     )
     seed: int = seed_option()
     method: str | None = opt(
@@ -123,16 +125,19 @@ class ValidateOptions:
         "number of crossings whose truth is drawn from the priors (default: 200)",
         whole("a number of crossings", 0),
         default=200,
+        metavar="N",
     )
     control: int = opt(
         "number of crossings repeated with only half of their noise declared (default: 20)",
         whole("a number of crossings", 0),
         default=20,
+        metavar="N",
     )
     out_of_model: int = opt(
         "number of crossings for each out-of-model effect (default: 0)",
         whole("a number of crossings", 0),
         default=0,
+        metavar="N",
     )
     effects: tuple[str, ...] = opt(
         f"out-of-model effects, see docs/validation.md: {', '.join(EFFECTS)} (default: all)",
@@ -152,6 +157,7 @@ class ValidateOptions:
         "else is run (default: 0)",
         whole("a number of surveys", 0),
         default=0,
+        metavar="N",
     )
     kinds: tuple[str, ...] = opt(
         f"kinds of survey, see studies/surveys.md: {', '.join(_KINDS)} (default: all)",
@@ -165,7 +171,9 @@ class ValidateOptions:
         default=Path("../shared/crossings"),
         metavar="DIR",
     )
-    processes: int = opt("number of processes (default: 2)", whole("processes", 1, 256), default=2)
+    processes: int = opt(
+        "number of processes (default: 2)", whole("processes", 1, 256), default=2, metavar="N"
+    )
     page: Path | None = output_option("Markdown page of the results", "PAGE.md", VALIDATION_PAGE)
 
 

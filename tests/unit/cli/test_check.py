@@ -123,5 +123,5 @@ def test_the_last_line_says_that_nothing_is_wrong(
     site.write_text(text.replace("[vehicle]\n", f"[vehicle]\n{known}", 1))
     assert cli.main(["check", str(site)]) == 0
     assert capsys.readouterr().out.endswith(
-        "\nno finding speaks against a survey: driveby survey shows what it would detect\n"
+        "\nnothing is wrong or open: driveby survey forecasts what a survey would detect\n"
     )
