@@ -89,7 +89,7 @@ def _of_the_plan(found: SurveyForecast) -> str:
         )
     count = count_of(planned.needed_middle, "crossing")
     verb = "detects" if planned.needed_middle == 1 else "detect"
-    return f"{count} {how} {verb} {what}; {_ends(planned)}."
+    return f"{count} {how} {verb} {what}; {_ends(planned)}. {_clear(planned)}"
 
 
 def _ends(outlook: PlanForecast) -> str:
@@ -98,6 +98,17 @@ def _ends(outlook: PlanForecast) -> str:
     if outlook.needed_ends == outlook.needed_middle:
         return "the ends need no more"
     return f"the ends need {outlook.needed_ends}"
+
+
+def _clear(planned: PlanForecast) -> str:
+    """Return a sentence on the loss that a report, which compares elements, calls clear."""
+    if planned.clear_middle is not None:
+        return f"A report calls it clear after {count_of(planned.clear_middle, 'crossing')}."
+    smallest = percent(planned.expected.smallest_clear_loss[planned.middle])
+    return (
+        f"A report does not call it clear even after {MAX_CROSSINGS}; after "
+        f"{planned.expected.crossings} it calls a loss of {smallest} clear."
+    )
 
 
 def _of_the_others(found: SurveyForecast) -> str:

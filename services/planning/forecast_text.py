@@ -49,7 +49,11 @@ def _outlook_json(one: PlanForecast) -> dict[str, Any]:
         "middle_element": one.middle + 1,
         "one_crossing": _expected_json(one.once),
         "all_crossings": _expected_json(one.expected),
-        "crossings_needed": {"middle": one.needed_middle, "ends": one.needed_ends},
+        "crossings_needed": {
+            "middle": one.needed_middle,
+            "ends": one.needed_ends,
+            "clear_middle": one.clear_middle,
+        },
     }
 
 
@@ -103,16 +107,17 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     yield ""
     yield from _aligned(_comparison(found))
     yield f"after {question.crossings} crossings; overall, mid: standard deviations of the overall"
-    yield "stiffness and of EI at midspan; seen, smallest: at midspan; needed, ends:"
-    yield f"crossings until the loss is detected with {wanted} probability at midspan; at both"
-    yield f"ends (elsewhere between the two numbers); –: more than {MAX_CROSSINGS};"
+    yield "stiffness and of EI at midspan; smallest: at midspan; needed, ends: crossings"
+    yield f"until the loss is detected with {wanted} probability at midspan; at both ends"
+    yield "(elsewhere between the two numbers); clear: until a report calls the loss at"
+    yield f"midspan clear; –: more than {MAX_CROSSINGS};"
     yield "equal single tyres: on equal tracks, to a centimetre;"
     yield "at … t: at most 18 t, with three axles 26 t, as in the EU; national limits may"
     yield "be lower;"
     yield "in the other direction: in the opposite lane;"
     yield "… elements: fewer, longer ones;"
     if found.speeds:
-        yield "at … m/s: all runs at one speed; needed and ends not computed;"
+        yield "at … m/s: all runs at one speed; needed, ends and clear not computed;"
     yield from _not_advised(found)
     yield ""
     for line in warnings(found):
@@ -172,15 +177,15 @@ def _elements(found: SurveyForecast) -> list[list[str]]:
 
 
 def _comparison(found: SurveyForecast) -> list[list[str]]:
-    rows = [["what if", "overall", "mid", "seen", "smallest", "needed", "ends"]]
+    rows = [["what if", "overall", "mid", "smallest", "needed", "ends", "clear"]]
     rows += [_cells(one, one.plan.label) for one in (found.planned, *found.others)]
     rows += [
         [
             f"at {at.speed_m_per_s:g} m/s",
             _percent(at.level_std),
             _percent(at.std_middle),
-            _percent(at.seen_middle),
             _percent(at.smallest_middle),
+            "",
             "",
             "",
         ]
@@ -198,10 +203,10 @@ def _cells(one: PlanForecast, name: str) -> list[str]:
         name,
         _percent(one.expected.level_std),
         _percent(one.expected.std[e]),
-        _percent(one.expected.seen[e]),
         _percent(one.expected.smallest_loss[e]),
         _count(one.needed_middle),
         _count(one.needed_ends),
+        _count(one.clear_middle),
     ]
 
 

@@ -72,6 +72,8 @@ class PlanForecast(NamedTuple):
     """Crossings needed to detect the loss there; None beyond MAX_CROSSINGS."""
     needed_ends: int | None
     """The same at both ends."""
+    clear_middle: int | None
+    """Crossings until a report calls the loss at the middle clear; None beyond MAX_CROSSINGS."""
 
 
 class SpeedForecast(NamedTuple):
@@ -179,8 +181,15 @@ def _forecast_of(
     middles = middle_elements(plan.site.bridges[0])
     last = plan.site.bridges[0].elements - 1
 
-    def errors_of(crossings: int) -> detection.DetectionErrors:
-        return _errors(simulated, plan, tracks, crossings)
+    def is_seen(crossings: int, elements: tuple[int, ...]) -> bool:
+        errors = _errors(simulated, plan, tracks, crossings)
+        seen = detection.detection_probability(question.loss, errors.of_nominal)
+        return bool(seen[list(elements)].min() >= DETECTION_PROBABILITY)
+
+    def is_clear(crossings: int) -> bool:
+        errors = _errors(simulated, plan, tracks, crossings)
+        clear = clear_loss_detectable(NORMAL_975 * errors.of_others)
+        return bool(clear[list(middles)].max() <= question.loss)
 
     expected = _expected(simulated, plan, tracks, question.crossings, question.loss)
     return PlanForecast(
@@ -188,8 +197,9 @@ def _forecast_of(
         _expected(simulated, plan, tracks, 1, question.loss),
         expected,
         _less_determined(plan.site.bridges[0], expected),
-        _needed(errors_of, question.loss, middles, plan.fewest_crossings),
-        _needed(errors_of, question.loss, (0, last), plan.fewest_crossings),
+        _needed(lambda crossings: is_seen(crossings, middles), plan.fewest_crossings),
+        _needed(lambda crossings: is_seen(crossings, (0, last)), plan.fewest_crossings),
+        _needed(is_clear, plan.fewest_crossings),
     )
 
 
@@ -279,28 +289,15 @@ def _at_speed(
     )
 
 
-def _needed(
-    errors_of: Callable[[int], detection.DetectionErrors],
-    loss: float,
-    elements: tuple[int, ...],
-    fewest: int = 1,
-) -> int | None:
-    """Return the fewest crossings that detect the loss with certainty in these elements.
-
-    A plan has at least `fewest` crossings.
-    """
-
-    def is_seen(crossings: int) -> bool:
-        seen = detection.detection_probability(loss, errors_of(crossings).of_nominal)
-        return bool(seen[list(elements)].min() >= DETECTION_PROBABILITY)
-
-    if not is_seen(MAX_CROSSINGS):
+def _needed(is_enough: Callable[[int], bool], fewest: int = 1) -> int | None:
+    """Return the fewest crossings that are enough, at least `fewest`; None beyond MAX_CROSSINGS."""
+    if not is_enough(MAX_CROSSINGS):
         return None
     too_few, enough = fewest - 1, MAX_CROSSINGS
     while enough - too_few > 1:
         tried = (too_few + enough) // 2 if enough < 64 else round(np.sqrt(max(1, too_few) * enough))
         tried = min(max(tried, too_few + 1), enough - 1)
-        too_few, enough = (too_few, tried) if is_seen(tried) else (tried, enough)
+        too_few, enough = (too_few, tried) if is_enough(tried) else (tried, enough)
     return enough
 
 

@@ -1,7 +1,7 @@
 """`driveby survey` from its arguments to its files: one plan, and what is refused."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,12 @@ def test_a_plan_of_the_example(
     assert "forecasting 12 crossings of bridge-1 by truck-1 and the alternatives: 10 p" in errors
     assert "at … t: at most 18 t, with three axles 26 t, as in the EU" in out
     plan = json.loads(found.read_text(encoding="utf-8"))
+    last, middle = plan["growth"][-1], plan["planned"]["middle_element"] - 1
+    assert last["crossings"] == 300
+    assert last["smallest_clear_loss"][middle] > plan["loss"]
+    assert plan["planned"]["crossings_needed"]["clear_middle"] is None
+    tandem = next(one for one in plan["alternatives"] if "tandem" in one["name"])
+    assert tandem["crossings_needed"]["clear_middle"] > tandem["crossings_needed"]["middle"]
     assert picture.stat().st_size > 10_000
     planned = plan["planned"]["all_crossings"]
     assert 0.06 < planned["level_std"] < 0.16
@@ -90,13 +96,13 @@ def expected(std: float, crossings: int = 12) -> SurveyExpectation:
 def made_up(needed: int | None, others: dict[str, float], speed: float = 10.0) -> SurveyForecast:
     site = with_noise(paper_site(), (25.0,) * 4)
     plan = as_planned(site, speed)
-    planned = PlanForecast(plan, expected(0.3, 1), expected(0.2), 3, needed, None)
+    planned = PlanForecast(plan, expected(0.3, 1), expected(0.2), 3, needed, None, 30)
     return SurveyForecast(
         SurveyQuestion(0.2, 12, speed, (speed, speed)),
         PlannedRoad("A", 0.12),
         planned,
         tuple(
-            PlanForecast(plan._replace(name=name), expected(std, 1), expected(std), 3, 4, 60)
+            PlanForecast(plan._replace(name=name), expected(std, 1), expected(std), 3, 4, 60, 25)
             for name, std in others.items()
         ),
         (),
@@ -126,6 +132,15 @@ def test_the_advice_names_what_helps_most() -> None:
     assert blind.startswith("Even 300 crossings")
     assert "60 % or more" in blind
     assert blind.endswith("No other change of truck, load, direction or sensors helps much.")
+
+
+def test_advice_states_what_a_report_calls_clear() -> None:
+    found = made_up(9, {})
+    assert "ends would take more than 300. A report calls it clear after 30 cr" in advice(found)
+    never = found._replace(planned=found.planned._replace(clear_middle=None))
+    assert "not call it clear even after 300; after 12 it calls a loss of 60 % clear" in advice(
+        never
+    )
 
 
 def test_what_makes_a_survey_blind_is_warned_of() -> None:
@@ -206,18 +221,13 @@ def test_each_number_of_crossings_is_forecast_once(monkeypatch: pytest.MonkeyPat
 
 
 def test_needed_is_the_fewest() -> None:
-    def errors_of(crossings: int) -> planning.detection.DetectionErrors:
-        std = np.full(3, 0.5 / np.sqrt(crossings))
-        return planning.detection.DetectionErrors(std, std)
+    def enough(number: int) -> Callable[[int], bool]:
+        return lambda crossings: crossings >= number
 
-    needed = planning._needed(errors_of, 0.2, (1,))
-    assert needed is not None
-    probability = planning.detection.detection_probability
-    assert probability(0.2, errors_of(needed).of_nominal)[1] >= 0.95
-    assert probability(0.2, errors_of(needed - 1).of_nominal)[1] < 0.95
-    assert planning._needed(errors_of, 0.01, (1,)) is None
-    assert planning._needed(errors_of, 0.9, (1,)) == 1
-    assert planning._needed(errors_of, 0.9, (1,), fewest=2) == 2
+    for number in (1, 2, 3, 17, 63, 64, 65, 299, 300):
+        assert planning._needed(enough(number)) == number
+    assert planning._needed(enough(301)) is None
+    assert planning._needed(enough(1), fewest=2) == 2
 
 
 def test_half_of_the_runs_takes_at_least_two_crossings() -> None:

@@ -46,7 +46,7 @@ def forecast(
         limit = np.full(7, smallest)
         expected = SurveyExpectation(crossings, wide, 0.1, wide, wide, limit, limit)
         of = of_tandem if name == TANDEM else plan
-        return PlanForecast(of._replace(name=name), expected, expected, 3, middle, ends)
+        return PlanForecast(of._replace(name=name), expected, expected, 3, middle, ends, None)
 
     rows = others if tandem is None else {**others, TANDEM: tandem}
     outlook = row("as planned", planned)
