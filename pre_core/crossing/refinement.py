@@ -8,6 +8,7 @@ from pre_core.crossing.fit import (
     HOPELESS_CHI2,
     Optimum,
     SearchStrategy,
+    chi2_per_dof,
     complete_fit,
     fit_all,
     is_accepted,
@@ -19,8 +20,10 @@ from pre_core.crossing.frequency_continuation import (
     other_bridges,
 )
 from pre_core.crossing.mismatch import has_alike_tyres
+from pre_core.crossing.noise import no_suspension_noise
 from pre_core.crossing.posterior import has_tandem, layout
-from pre_core.crossing.walk import better_neighbour, shifted_to
+from pre_core.crossing.preparation import update_noise
+from pre_core.crossing.walk import better_neighbour, scan_offsets, shifted_to
 from pre_core.search.loop import Termination
 
 _CLEAR_RESTRAINT = 0.5
@@ -32,6 +35,11 @@ _TRIED_BRIDGES = 2
 """Limit of other bridges from which all parameters are fitted, after each optimum."""
 _KEPT_RIVALS = 4
 """Limit of other bridges near which the posterior is drawn, too."""
+_FAILED_ROUNDS = 2
+"""Rounds without a better bridge, ends alike and one at a time, after which no other is tried."""
+_COMPLETED_CHI2 = 60.0
+"""Value of chi2 up to which fits from other bridges about a truck are completed: with the true
+truck one at 46 led to the true bridge."""
 
 
 def refined(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> tuple[Optimum, int]:
@@ -46,47 +54,87 @@ def about_truck(
 ) -> tuple[Optimum | None, int]:
     """Return the best optimum of bridges about a truck at y (size,), and the evaluations.
 
-    The truck explains the residuals off the bridge, where no bridge acts, so a misfit may be due to
-    a bridge that vibrates at another frequency. Bridges of other frequencies are tried about this
-    truck, and about each better optimum; None if the first ones fit no better than `found`.
+    The truck explains the residuals off the bridge, where no bridge acts, so a misfit of `found`
+    may be due to a bridge that vibrates at another frequency. Bridges of other frequencies are
+    tried about this truck and, if none of them is accepted, about the likeliest offset of a bridge
+    under it. None if no fit from a bridge about this truck was worth completing.
     """
-    best, around, evaluations = None, found._replace(state=found.state._replace(y=y)), 0
-    chi2, is_even = found.chi2_per_dof, True
-    while evaluations <= max_evaluations:
+    truck = _at_full_weight(found, y)
+    best, evaluations = _best_bridge(truck, None, strategy, max_evaluations)
+    if best is None or is_accepted(best.problem, best.chi2_per_dof):
+        return best, evaluations
+    if evaluations > max_evaluations:
+        return best, evaluations
+    places, used = scan_offsets(truck.problem, y, strategy)
+    evaluations += used
+    if not places:
+        return best, evaluations
+    start = shifted_to(truck.problem, y, places[0])
+    at_offset, used = _fitted(truck, start, strategy, _COMPLETED_CHI2)
+    evaluations += used
+    if at_offset is not None and at_offset.unfinished is None:
+        around = _at_full_weight(at_offset, at_offset.state.y)
+        other, used = _best_bridge(around, at_offset, strategy, max_evaluations - evaluations)
+        evaluations += used
+        best = min(best, other or best, key=lambda one: one.chi2_per_dof)
+    return best, evaluations
+
+
+def _best_bridge(
+    around: Optimum, best: Optimum | None, strategy: SearchStrategy, max_evaluations: int
+) -> tuple[Optimum | None, int]:
+    """Return the best of `best` and optima of other bridges about `around`, and the evaluations.
+
+    They are tried again about each better one: the bridge next to a wrong one may be the true one.
+    """
+    evaluations, failed, is_even = 0, 0, True
+    while failed < _FAILED_ROUNDS and evaluations <= max_evaluations:
         others, used = other_bridges(around, strategy, is_even=is_even)
-        better, used_by_fits = _best_fit(around, others, strategy)
+        fits, used_by_fits = _fits(around, others, strategy)
         evaluations += used + used_by_fits
-        if better is None or better.chi2_per_dof >= chi2:
-            break
-        best = around = better
-        chi2, is_even = better.chi2_per_dof, not is_even
-        if is_accepted(better.problem, chi2):
+        failed, is_even = failed + 1, not is_even
+        for fit in fits:
+            here = _at_full_weight(fit, fit.state.y)
+            if best is None or is_better(here, around):
+                best, around, failed = fit, here, 0
+        if best is None:
             break
     return best, evaluations
 
 
-def _best_fit(
+def _at_full_weight(found: Optimum, y: FloatArray) -> Optimum:
+    """Return an optimum displaced to y (size,), with full weight of the body equations."""
+    problem = update_noise(found.problem, y, no_suspension_noise())
+    return found._replace(
+        problem=problem,
+        state=found.state._replace(y=y),
+        chi2_per_dof=chi2_per_dof(problem, y),
+    )
+
+
+def _fits(
     around: Optimum, others: list[OtherBridge], strategy: SearchStrategy
-) -> tuple[Optimum | None, int]:
-    """Return the best fit of all parameters from the likeliest other bridges, and evaluations."""
-    best: Optimum | None = None
+) -> tuple[list[Optimum], int]:
+    """Return the completed fits from the likeliest other bridges, and the evaluations.
+
+    An accepted one is the last.
+    """
+    fits: list[Optimum] = []
     evaluations = 0
     for other in _likeliest(others):
-        fitted, used = _fitted(around, other, strategy, HOPELESS_CHI2)
+        fitted, used = _fitted(around, other.y, strategy, _COMPLETED_CHI2)
         evaluations += used
-        if fitted is None:
+        if fitted is None or fitted.unfinished is not None:
             continue
-        is_fit = is_accepted(fitted.problem, fitted.chi2_per_dof)
-        if is_fit and fitted.ending is not Termination.CONVERGED:
+        if fitted.chi2_per_dof <= HOPELESS_CHI2 and fitted.ending is not Termination.CONVERGED:
             # A bridge far from the first one may need more steps than a fit takes.
             again, used = fit_all(fitted.problem, fitted.state.y, strategy)
             evaluations += used
             fitted = fitted if again is None else again
-        if best is None or fitted.chi2_per_dof < best.chi2_per_dof:
-            best = fitted
-        if is_accepted(best.problem, best.chi2_per_dof):
+        fits.append(fitted)
+        if is_accepted(fitted.problem, fitted.chi2_per_dof):
             break
-    return best, evaluations
+    return fits, evaluations
 
 
 def _likeliest(others: list[OtherBridge]) -> list[OtherBridge]:
@@ -95,13 +143,13 @@ def _likeliest(others: list[OtherBridge]) -> list[OtherBridge]:
 
 
 def _fitted(
-    around: Optimum, other: OtherBridge, strategy: SearchStrategy, completed_to: float = np.inf
+    around: Optimum, y: FloatArray, strategy: SearchStrategy, completed_to: float = np.inf
 ) -> tuple[Optimum | None, int]:
-    """Return the fit of all parameters from another bridge, if there is one, and evaluations.
+    """Return the fit of all parameters from y (size,), if there is one, and evaluations.
 
     It is completed up to a chi2 of `completed_to`.
     """
-    fitted, used = fit_all(around.problem, other.y, strategy)
+    fitted, used = fit_all(around.problem, y, strategy)
     if fitted is None or fitted.chi2_per_dof > completed_to:
         return fitted, used
     completed = complete_fit(fitted)
@@ -127,12 +175,12 @@ def _with_other_bridge(
     evaluations = 0
     rivals: list[OtherBridge] = []
     failed, is_even = 0, True
-    while failed < 2 and evaluations <= max_evaluations and _is_sharp(found):
+    while failed < _FAILED_ROUNDS and evaluations <= max_evaluations and _is_sharp(found):
         others, used = other_bridges(found, strategy, is_even=is_even)
         evaluations += used
         before = found
         for other in _likeliest(others):
-            fitted, used = _fitted(found, other, strategy)
+            fitted, used = _fitted(found, other.y, strategy)
             evaluations += used
             if fitted is not None and is_better(fitted, found):
                 found = fitted

@@ -389,51 +389,89 @@ def test_without_a_fit_the_best_poor_start_is_completed(
 @pytest.mark.parametrize(
     ("chi2", "best", "sets"),
     [
-        # The first bridge about the truck is the right one.
-        ((1.0,), 1.0, 1),
-        # The second of the first set is better, and leads to another one.
-        ((6.0, 3.0, 1.0), 1.0, 2),
-        # None fits better than what was found before.
-        ((6.0, 5.0), None, 1),
-        # The second set leads no further.
-        ((3.0, 4.0, 3.0, 3.5), 3.0, 2),
+        # The first bridge about the truck is accepted, and no other is better.
+        ((1.0, 3.0, 3.0, 3.0, 3.0), 1.0, 3),
+        # The second of the first set is better, and leads to an accepted one.
+        ((6.0, 3.0, 1.0, 2.0, 2.0, 2.0, 2.0), 1.0, 4),
+        # An accepted bridge leads to a better one.
+        ((1.2, 1.0, 1.1, 1.1), 1.0, 4),
+        # Fits that are not worth completing end the search.
+        ((61.0, 70.0), None, 1),
     ],
 )
 def test_other_bridges_about_a_truck_are_tried_as_long_as_they_fit_better(
     chi2: tuple[float, ...], best: float | None, sets: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    reached, about = iter(chi2), []
+    fits = iter(chi2)
+    about = tried_bridges(fits, monkeypatch)
+    first = found(5.0, 1)._replace(state=SimpleNamespace(y=np.zeros(1), _replace=moved))
+    other, used = refinement.about_truck(first, np.full(1, 7.0), STRATEGY, 1000)
+    assert (other.chi2_per_dof if other else None) == best
+    assert about[0] == ([7.0], True)
+    assert [is_even for _, is_even in about] == [True, False, True, False][:sets]
+    assert used == 10 * sets + len(chi2)
+    assert not list(fits)
+
+
+def test_bridge_at_another_offset_is_fitted_where_none_about_the_truck_is_accepted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    reached = iter((3.0, 3.0, *(3.0, 3.0) * 2, 2.0, 1.0, *(1.0,) * 2))
+    about = tried_bridges(reached, monkeypatch)
+    first = found(5.0, 1)._replace(state=SimpleNamespace(y=np.zeros(1), _replace=moved))
+    other, used = refinement.about_truck(first, np.full(1, 7.0), STRATEGY, 1000)
+    assert other is not None
+    assert other.chi2_per_dof == 1.0
+    assert len(about) == 6
+    assert not list(reached)
+    assert used == 10 * len(about) + 10 + 500
+    # No offset is scanned where all evaluations were used.
+    reached = iter((3.0,) * 2)
+    about = tried_bridges(reached, monkeypatch)
+    other, used = refinement.about_truck(first, np.full(1, 7.0), STRATEGY, 11)
+    assert other is not None
+    assert (other.chi2_per_dof, used) == (3.0, 12)
+
+
+def tried_bridges(
+    reached: Iterator[float], monkeypatch: pytest.MonkeyPatch
+) -> list[tuple[list[float], bool]]:
+    """Replace fits by ones that reach these chi2; return the list of where bridges are tried."""
+    about = []
 
     def others(one: Any, _: Any, *, is_even: bool) -> tuple[list[Any], int]:
         about.append((one.state.y.tolist(), is_even))
         return [SimpleNamespace(y=np.ones(1), gain=gain) for gain in (9.0, 8.0, 7.0, -1.0)], 10
 
+    def fitted(*_: Any) -> tuple[Optimum, int]:
+        chi2 = next(reached)
+        return found(chi2, 1)._replace(unfinished=STRATEGY if chi2 > 50.0 else None), 1
+
     monkeypatch.setattr(refinement, "other_bridges", others)
     monkeypatch.setattr(refinement, "is_accepted", lambda _, value: value < 1.5)
+    monkeypatch.setattr(
+        refinement, "is_better", lambda one, other: one.chi2_per_dof < other.chi2_per_dof
+    )
+    monkeypatch.setattr(refinement, "_at_full_weight", lambda one, y: one._replace(state=moved(y)))
     monkeypatch.setattr(refinement, "complete_fit", lambda one: one)
-    monkeypatch.setattr(refinement, "fit_all", lambda *_: (found(next(reached), 1), 1))
-    first = found(5.0, 1)._replace(state=SimpleNamespace(y=np.zeros(1), _replace=moved))
-    other, used = refinement.about_truck(first, np.full(1, 7.0), STRATEGY, 1000)
-    assert (other.chi2_per_dof if other else None) == best
-    assert about == [([7.0], True), ([0.0], False)][:sets]
-    assert used == 10 * sets + len(chi2)
-    assert not list(reached)
+    monkeypatch.setattr(refinement, "scan_offsets", lambda *_: ([SimpleNamespace()], 500))
+    monkeypatch.setattr(refinement, "shifted_to", lambda *_: np.full(1, 3.0))
+    monkeypatch.setattr(refinement, "fit_all", fitted)
+    return about
 
 
-def test_an_accepted_bridge_that_took_all_steps_is_fitted_on(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_bridge_whose_fit_took_all_steps_is_fitted_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried_bridges(iter(()), monkeypatch)
     ends = iter((Termination.STEPS_EXHAUSTED, Termination.CONVERGED))
     bridge = [SimpleNamespace(y=np.ones(1), gain=9.0)]
-    monkeypatch.setattr(refinement, "other_bridges", lambda *_, **__: (bridge, 10))
-    monkeypatch.setattr(refinement, "is_accepted", lambda _, value: value < 1.5)
-    monkeypatch.setattr(refinement, "complete_fit", lambda one: one)
+    sets = iter((bridge, [], []))
+    monkeypatch.setattr(refinement, "other_bridges", lambda *_, **__: (next(sets), 10))
     monkeypatch.setattr(refinement, "fit_all", lambda *_: (found(1.0, 1, next(ends)), 1))
     first = found(5.0, 1)._replace(state=SimpleNamespace(y=np.zeros(1), _replace=moved))
     other, used = refinement.about_truck(first, np.zeros(1), STRATEGY, 1000)
     assert other is not None
     assert other.ending is Termination.CONVERGED
-    assert used == 12
+    assert used == 32
 
 
 def moved(y: NDArray[np.float64]) -> Any:
@@ -442,30 +480,37 @@ def moved(y: NDArray[np.float64]) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("chi2", "off_bridge", "force", "is_tried"),
+    ("chi2", "off_bridge", "reached", "ends_at"),
     [
-        (5.0, 1.0, 0.0, True),
-        (51.0, 1.0, 0.0, False),
-        (5.0, 1.6, 0.0, False),
-        (5.0, 1.0, 1.0, False),
+        (5.0, 1.0, 1.0, [1.0]),
+        # Hopeless, or the truck does not explain what is off the bridge, or nothing is better.
+        (51.0, 1.0, 1.0, []),
+        (5.0, 1.6, 1.0, []),
+        (5.0, 1.0, 5.0, []),
     ],
 )
 def test_other_bridges_are_tried_where_only_the_bridge_is_not_explained(
     chi2: float,
     off_bridge: float,
-    force: float,
-    is_tried: bool,
+    reached: float,
+    ends_at: list[float],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(optimum, "is_accepted", lambda _, value: value < 1.5)
     monkeypatch.setattr(optimum, "strongest_line_at_hz", lambda *_: 0.0)
+    monkeypatch.setattr(optimum, "complete_fit", lambda one: one)
     monkeypatch.setattr(misfit, "levels_at", lambda problem, y: np.zeros(1))
-    monkeypatch.setattr(optimum, "about_truck", lambda *_: (found(1.0, 1), 30))
+    monkeypatch.setattr(optimum, "about_truck", lambda *_: (found(reached, 1), 30))
     one = found(chi2, 4)
-    one.problem.force = np.array([force])
     alone = OffBridgeFit(np.zeros(1), off_bridge, 10)
-    tried = optimum._about_truck([one], alone, lambda *_: None, 1000)
-    assert [(other.chi2_per_dof, other.evaluations) for other in tried] == [(1.0, 30)] * is_tried
+    monkeypatch.setattr(optimum, "_refine_candidates", lambda *_: one)
+    monkeypatch.setattr(optimum, "_other_strategies", lambda _: ((), alone))
+    monkeypatch.setattr(optimum, "_try_strategies", lambda *_: [])
+    problem: Any = SimpleNamespace(crossing=SimpleNamespace(lead=NO_LEAD))
+    ended = optimum._run_strategies(problem, np.zeros(1), lambda *_: None, 1000)
+    assert [other.chi2_per_dof for other in ended] == [chi2, *ends_at]
+    is_tried = chi2 < 50.0 and off_bridge < 1.5
+    assert sum(other.evaluations for other in ended) == 4 + 10 + 30 * is_tried
 
 
 def completed(one: Optimum) -> Optimum:
