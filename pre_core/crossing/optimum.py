@@ -53,7 +53,7 @@ from pre_core.crossing.preparation import (
     update_noise,
     with_line,
 )
-from pre_core.crossing.refinement import about_truck, refined, with_free_ends
+from pre_core.crossing.refinement import about_truck, refined, with_free_ends, with_full_weight
 from pre_core.crossing.rows import RESIDUALS
 from pre_core.crossing.walk import Placement, scan_offsets, shifted_to
 from pre_core.search import levenberg_marquardt
@@ -159,7 +159,7 @@ def _run_strategies(
     budget = _Budget(max_evaluations, WORTH_COMPLETING_CHI2)
     found = [_refine_candidates(problem, y, simplest, report, budget)]
     if _has_ended(found):
-        return found
+        return [with_full_weight(found[0], _WITHOUT_MISMATCH[0], _MAX_ABOUT_TRUCK)]
     first = found[0]
     strategies, alone = _other_strategies(first)
     found[0] = first._replace(evaluations=first.evaluations + alone.evaluations)
@@ -191,10 +191,11 @@ def _about_truck(
 ) -> tuple[Optimum | None, int]:
     """Return the best optimum of other bridges about the truck off the bridge, and evaluations.
 
-    The truck explains what is off the bridge; None if no bridge fits better than all of `found`.
+    The truck explains what is off the bridge better than `found` explain all; None if no bridge
+    fits better than these.
     """
     chi2 = min(one.chi2_per_dof for one in found)
-    if chi2 > _WRONG_BRIDGE_CHI2:
+    if not alone.chi2 < chi2 <= _WRONG_BRIDGE_CHI2:
         return None, 0
     report("trying other bridges", 0.55)
     left = min(_MAX_ABOUT_TRUCK, max_evaluations - _evaluations_of_all(found))

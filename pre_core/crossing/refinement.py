@@ -19,6 +19,7 @@ from pre_core.crossing.frequency_continuation import (
     distinct_bridges,
     other_bridges,
 )
+from pre_core.crossing.misfit import fit_off_bridge, is_explained_off_bridge
 from pre_core.crossing.mismatch import has_alike_tyres
 from pre_core.crossing.noise import no_suspension_noise
 from pre_core.crossing.posterior import has_tandem, layout
@@ -212,6 +213,24 @@ def _refine_offset(
             break
         found = other
     return found, evaluations
+
+
+def with_full_weight(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> Optimum:
+    """Return the better optimum, at reduced weight of the body equations or about another bridge.
+
+    A wrong bridge moves the truck as its springs would not, and is accepted at reduced weight. Real
+    friction and nonlinear springs act off the bridge, too: where a linear truck explains the
+    residuals there, bridges about this truck are tried.
+    """
+    if not found.problem.force.any() or not is_accepted(found.problem, found.chi2_per_dof):
+        return found
+    alone = fit_off_bridge(found)
+    other, evaluations = None, alone.evaluations
+    if alone.chi2 < found.chi2_per_dof and is_explained_off_bridge(found.problem, alone):
+        other, used = about_truck(found, alone.y, strategy, max_evaluations)
+        evaluations += used
+    best = found if other is None or not is_better(other, found) else other
+    return best._replace(evaluations=found.evaluations + evaluations)
 
 
 def with_free_ends(found: Optimum, strategy: SearchStrategy) -> tuple[Optimum, int]:

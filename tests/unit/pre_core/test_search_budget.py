@@ -40,6 +40,7 @@ def found(chi2: float, evaluations: int, ending: Termination = Termination.CONVE
     unknown: Any = SimpleNamespace(
         y=np.zeros(1),
         lines_hz=(),
+        force=np.zeros(1),
         crossing=SimpleNamespace(lead=NO_LEAD),
         mismatch=SimpleNamespace(level_m3=np.zeros(1)),
     )
@@ -487,6 +488,8 @@ def moved(y: NDArray[np.float64]) -> Any:
         (51.0, 1.0, 1.0, []),
         (5.0, 1.6, 1.0, []),
         (5.0, 1.0, 5.0, []),
+        # The misfit is not on the bridge.
+        (1.49, 1.495, 1.0, []),
     ],
 )
 def test_other_bridges_are_tried_where_only_the_bridge_is_not_explained(
@@ -496,7 +499,7 @@ def test_other_bridges_are_tried_where_only_the_bridge_is_not_explained(
     ends_at: list[float],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(optimum, "is_accepted", lambda _, value: value < 1.5)
+    monkeypatch.setattr(optimum, "is_accepted", lambda _, value: value < 1.4)
     monkeypatch.setattr(optimum, "strongest_line_at_hz", lambda *_: 0.0)
     monkeypatch.setattr(optimum, "complete_fit", lambda one: one)
     monkeypatch.setattr(misfit, "levels_at", lambda problem, y: np.zeros(1))
@@ -509,8 +512,42 @@ def test_other_bridges_are_tried_where_only_the_bridge_is_not_explained(
     problem: Any = SimpleNamespace(crossing=SimpleNamespace(lead=NO_LEAD))
     ended = optimum._run_strategies(problem, np.zeros(1), lambda *_: None, 1000)
     assert [other.chi2_per_dof for other in ended] == [chi2, *ends_at]
-    is_tried = chi2 < 50.0 and off_bridge < 1.5
+    is_tried = off_bridge < min(chi2, 1.49) and chi2 < 50.0
     assert sum(other.evaluations for other in ended) == 4 + 10 + 30 * is_tried
+
+
+@pytest.mark.parametrize(
+    ("force", "off_bridge", "reached", "ends_at", "evaluations"),
+    [
+        (1.0, 1.0, 1.01, 1.01, 46),
+        # No bridge about the truck is likelier.
+        (1.0, 1.0, 1.3, 1.2, 46),
+        # The weight is full, or reduced off the bridge, too.
+        (0.0, 1.0, 1.01, 1.2, 4),
+        (1.0, 1.6, 1.01, 1.2, 16),
+        (1.0, 1.21, 1.01, 1.2, 16),
+    ],
+)
+def test_bridge_that_is_accepted_at_reduced_weight_alone_is_doubted(
+    force: float,
+    off_bridge: float,
+    reached: float,
+    ends_at: float,
+    evaluations: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    alone = OffBridgeFit(np.zeros(1), off_bridge, 12)
+    monkeypatch.setattr(misfit, "levels_at", lambda problem, y: np.zeros(1))
+    monkeypatch.setattr(refinement, "is_accepted", lambda _, value: value < 1.4)
+    monkeypatch.setattr(
+        refinement, "is_better", lambda one, other: one.chi2_per_dof < other.chi2_per_dof
+    )
+    monkeypatch.setattr(refinement, "fit_off_bridge", lambda _: alone)
+    monkeypatch.setattr(refinement, "about_truck", lambda *_: (found(reached, 1), 30))
+    one = found(1.2, 4)
+    one.problem.force = np.array([force])
+    best = refinement.with_full_weight(one, STRATEGY, 1000)
+    assert (best.chi2_per_dof, best.evaluations) == (ends_at, evaluations)
 
 
 def completed(one: Optimum) -> Optimum:
