@@ -16,9 +16,9 @@ FIRST_SEED = 1000
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [1, 4])
+@pytest.mark.parametrize("number", [1, 4, 8])
 def test_is_good_and_true(project: Path, number: int) -> None:
-    """One search had ended at another frequency, the draws of the other had not converged."""
+    """Two searches had ended at another frequency, the draws of the other had not converged."""
     known = load_site(project / "studies" / "scripts" / "lorry_24_m.toml")
     pair = VehicleBridgePair(known.vehicles[0].id, known.bridges[0].id)
     site = single_pair_site(known, pair)
