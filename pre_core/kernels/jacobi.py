@@ -19,7 +19,7 @@ is far below rounding."""
 
 @inner
 def _rotation(a: FloatArray, p: int, q: int, cosine: FloatArray, sine: FloatArray) -> float:
-    """Compute cosine and sine (4,) that annul a_pq; return its excess over negligible."""
+    """Compute cosine and sine (4,) that annul a_pq; return how far a_pq² exceeds the negligible."""
     left = -1.0
     for lane in range(LANES):
         off = a[p, q, lane]
@@ -93,9 +93,9 @@ def diagonalise(a: FloatArray, v: FloatArray) -> bool:
 def diagonalise_one(a: FloatArray, v: FloatArray) -> bool:
     """Rotate one matrix `a` (m, m) to diagonal form, reading both triangles; `v` is (m, m).
 
-    Unlike `diagonalise` it skips rotations without effect, which four matrices cannot agree on. It
-    also reverses the order of the matrix: beam modes rise by powers of ten, and a matrix graded in
-    this way needs half as many sweeps from its large end.
+    Results are as those of `diagonalise`. Unlike it, this function skips rotations without effect,
+    which are seldom the same for four matrices. It also reverses the order of the matrix: its
+    diagonal rises by powers of ten, and such a matrix needs half as many sweeps from its large end.
     """
     _reverse(a)
     v[:] = 0.0

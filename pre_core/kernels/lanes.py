@@ -20,14 +20,14 @@ Lanes = tuple[float, float, float, float]
 
 LANES = 4
 
-# A wrapper for calls from C or from Python contains the kernel once more and takes as long to
-# compile. C calls none. Kernels copy rows by loops: an assignment to a slice checks its shape, and
-# the check takes three seconds to compile.
+# A wrapper for calls from C or Python contains another copy of the kernel, which takes as long to
+# compile; none is called from C. Kernels copy rows by loops: an assignment to a slice checks its
+# shape, and the check takes three seconds to compile.
 compiled = partial(njit, cache=True, nogil=True, no_cfunc_wrapper=True)
 
-# A kernel that calls another one holds a copy of it, optimised once more with it: rounded otherwise
-# than the first one. Which of them is run, where it is not inlined, depends on which was loaded
-# first; a process that compiled gave other last digits than one that loaded. So all are inlined.
+# A kernel contains a copy of each kernel that it calls, which is optimised together with it and may
+# round differently. Without inlining, the copy that is loaded first is run, so that a process that
+# compiles and one that loads compiled kernels can differ in the last digits. So all are inlined.
 _inlined = partial(compiled, error_model="numpy", forceinline=True)
 
 # Every operation is rounded as written.
@@ -41,7 +41,7 @@ kernel = _inlined(fastmath=_CONTRACTED)
 # For sums over many terms, which may be taken in any order.
 summing = _inlined(fastmath={"contract", "nsz", "reassoc"})
 
-# For kernels that only kernels call: a call from Python would end the process.
+# For kernels that only kernels call: a call from Python would crash the process.
 _inner = partial(_inlined, no_cpython_wrapper=True)
 inner = _inner(fastmath=_CONTRACTED)
 inner_exact = _inner()

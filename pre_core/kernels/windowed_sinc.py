@@ -11,7 +11,7 @@ from pre_core.arrays import FloatArray
 
 
 def kaiser_beta(stop_band_db: float) -> float:
-    """Return the window's shape for a stop band of -`stop_band_db`, above 50 dB."""
+    """Return the window's parameter beta for a stop band of -`stop_band_db`, 50 dB or more."""
     return 0.1102 * (stop_band_db - 8.7)
 
 
@@ -21,8 +21,8 @@ def windowed_sinc(
     """Return the weights (…) of samples at a `distance` (…) in samples from the wanted time.
 
     They are not normalised. `cutoff`, in cycles per sample, is the frequency of half amplitude; the
-    window ends at `reach`. There the Kaiser window is one (I_0(beta) in the middle): subtracting
-    that as `pedestal` avoids a jump when a sample comes into reach.
+    window ends at `reach` samples. The window is I_0(beta) in the middle and 1 at its ends: a
+    `pedestal` of 1 is subtracted to avoid a jump where a sample comes into reach.
     """
     inside = np.maximum(0.0, 1.0 - (distance / reach) ** 2)
     window = np.i0(beta * np.sqrt(inside)) - pedestal

@@ -7,17 +7,18 @@ is the bilinear transform of its transfer function,
     b_0 = a^2 + a c + lambda,  b_1 = 2 (lambda - a^2),  b_2 = a^2 - a c + lambda,  a = 2/step,
 
 so a mode costs a few multiplications per step. The recursion here is the direct form II, w[n] =
-p[n] - (b_1 w[n-1] + b_2 w[n-2])/b_0, q[n] = (w[n] + 2 w[n-1] + w[n-2])/b_0, with 1/b_0 split evenly
-into the mode shapes. It starts from rest before the first wheel arrives.
+p[n] - (b_1 w[n-1] + b_2 w[n-2])/b_0, q[n] = (w[n] + 2 w[n-1] + w[n-2])/b_0. The mode shape carries
+1/sqrt(b_0), under the force and under the wheel. The mode is at rest before the first wheel
+arrives.
 
 The march keeps w and its change d[n] = w[n] - w[n-1],
 
     d[n] = p[n] + (a^2 - a c - 3 lambda)/b_0 d[n-1] - 4 lambda/b_0 w[n-2].
 
-In the form above the factors of a slow mode are nearly 2 and -1. Their rounding, and that of their
-sum, is amplified (a^2/lambda) times: hundreds of roundings, different on every processor, which
-difference quotients then divide by their step. The use of w[n-2] instead of w[n-1] saves a step
-from waiting for the previous sum.
+In the form above the factors of a slow mode are nearly 2 and -1. Their rounding errors, and that of
+their sum, are amplified by a^2/lambda, to hundreds of units in the last place. These differ between
+processors, and difference quotients divide them by their step. With w[n-2] instead of w[n-1], a
+step need not wait for the sum of the previous one.
 """
 
 from typing import NamedTuple
@@ -38,17 +39,18 @@ from pre_core.physics.bridge import (
 )
 
 RIGID_M_PER_N = 2e-12
-"""Compliance added to every bearing, a hundredth of a micrometre under a heavy axle: without any
-compliance the spring would be infinitely stiff."""
+"""Compliance added to every bearing, 0.2 µm under an axle of 10 t: without any compliance the
+spring would be infinitely stiff."""
 
 
 class BeamBasis(NamedTuple):
-    """The data that evaluations share: the beam in coordinates that diagonalise the undamaged one.
+    """A beam in m modal coordinates of a reference beam, shared by all evaluations.
 
-    `stiffness` (n + 2 or n + 4, m, m) is dK/ds of the n elements' EI, of the rotational and, for
-    compliant bearings, of the vertical springs at the ends, in coordinates that make the mass
-    matrix of 1 kg/m the identity. `cubics` (n parts, 4, m) is the deflection in each part of an
-    element for each coordinate. `lengths_m` is (n parts,).
+    `stiffness` (n + 2 or n + 4, m, m) has dK/ds for the EI of the n elements, then for the two
+    rotational springs at the ends, then for the two vertical ones if bearings are compliant. The
+    mass matrix of 1 kg/m is the identity. `cubics` (n * parts, 4, m) has the deflection in each
+    part for a unit of each coordinate, as powers of the place 0..1 within the part. `lengths_m` is
+    (n * parts,).
     """
 
     stiffness: FloatArray
@@ -61,11 +63,11 @@ class ModalFilters(NamedTuple):
 
     cubics: FloatArray  # (parts, g, 4, 4): see `modal_filters`
     feedback: FloatArray  # (g, factors, 4)
-    state: FloatArray  # (g, 2, 4)
+    state: FloatArray  # (g, 2, 4): w[n] and d[n] here, w[n] and w[n-1] in `modal_response`
 
 
 class WheelStretch(NamedTuple):
-    """A stretch of samples in which each wheel stays in one part of the bridge."""
+    """Input and output of `advance`: samples during which each wheel stays in one part."""
 
     front: int
     """Part under the front wheel; -1 off the bridge."""
@@ -88,9 +90,9 @@ def beam_basis(
     """Return a beam in the lowest modes of the uniform beam, its n elements cut into `parts`.
 
     Without `coordinates` all modes are used, which is the finite-element model itself. Fewer are
-    faster but poor for a beam that is not uniform or has springs at its supports, whose kinked
-    curvature smooth modes do not span: f_1 of the paper's scenario 6 is 1 % off with 14 of 28.
-    `element_lengths_m` is (n,); `interior_supports` are nodes between elements. With
+    faster, but inaccurate for a beam that is not uniform or has springs at its supports: smooth
+    modes do not span its kinked curvature. With 14 of 28 modes, f_1 of the paper's scenario 6 is
+    1 % off. `element_lengths_m` is (n,); `interior_supports` are nodes between elements. With
     `has_compliant_bearings` each end has a vertical spring.
     """
     n = element_lengths_m.size
@@ -120,8 +122,9 @@ def beam_basis(
 def change_basis(basis: BeamBasis, theta: FloatArray) -> BeamBasis:
     """Return the same beam in coordinates that diagonalise the bridge `theta` (p,).
 
-    Bridges near it are then nearly diagonal, and their modes are quick to compute. Every mode rises
-    from the start: the sign of an eigenvector is arbitrary, but initial vibration depends on it.
+    Stiffness matrices of similar bridges are then nearly diagonal, and their modes are quick to
+    compute. Every mode has a positive slope at the bridge's start: the sign of an eigenvector is
+    arbitrary, but the parameters of initial vibration depend on it.
     """
     factors = stiffness_factors(theta, basis.stiffness.shape[0])
     _, shapes = eigh(np.tensordot(factors, basis.stiffness, axes=1))
@@ -176,10 +179,11 @@ def modal_filters(
     cubics: FloatArray,
     feedback: FloatArray,
 ) -> bool:
-    """Compute the recursions of the modes of four bridges; return False if not finite.
+    """Compute the recursions of the modes of four bridges; return False if a value is not finite.
 
-    `theta` is (4, p). Outputs: `cubics` (parts, m, 4, 4) [part, mode, power, vector], scaled by
-    1/sqrt(b_0), and `feedback` (m, 2, 4), the factors of w[n-2] and d[n-1].
+    `theta` is (4, p); `matrix` and `vectors` (m, m, 4) are buffers. Outputs: `cubics` (parts, m, 4,
+    4) [part, mode, power, vector], mode shapes over sqrt(rho A b_0), and `feedback` (m, 2, 4), the
+    factors of w[n-2] and d[n-1].
     """
     basis_stiffness, basis_cubics = basis.stiffness, basis.cubics
     factors, m = basis_stiffness.shape[0], basis_stiffness.shape[1]
@@ -219,7 +223,7 @@ def modal_filters(
 def diagonalise_bridge(
     basis_stiffness: FloatArray, theta: FloatArray, matrix: FloatArray, vectors: FloatArray
 ) -> bool:
-    """Diagonalise one bridge `theta` (p,); return False if not finite.
+    """Diagonalise one bridge `theta` (p,); return False if a value is not finite.
 
     On return `matrix` (m, m) has the eigenvalues times rho A on its diagonal and `vectors` (m, m)
     the mode shapes in its rows.
@@ -275,7 +279,8 @@ def modal_filters_one(
     """Compute the recursions of one bridge `theta` (p,), its modes in the lanes: g groups of four.
 
     `matrix` and `vectors` are (m, m). Outputs: `cubics` (parts, g, 4, 4) [part, group, power, mode]
-    and `feedback` (g, 2, 4); lanes beyond the last mode stay zero. Return False if not finite.
+    and `feedback` (g, 2, 4); lanes beyond the last mode stay zero. Return False if a value is not
+    finite.
     """
     if not diagonalise_bridge(basis.stiffness, theta, matrix, vectors):
         return False
@@ -362,7 +367,10 @@ def _one_mode_one_wheel(
 
 @inner
 def advance(filters: ModalFilters, wheels: WheelStretch) -> None:
-    """Advance all modes over a stretch: update `filters.state`, and *add* to the deflections."""
+    """Advance all modes over a stretch: update `filters.state`, and *add* to the deflections.
+
+    A stretch without a wheel on the bridge changes nothing: the modes do not vibrate freely.
+    """
     front = filters.cubics[max(wheels.front, 0)]
     rear = filters.cubics[max(wheels.rear, 0)]
     feedback, state, force = filters.feedback, filters.state, wheels.force

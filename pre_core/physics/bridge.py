@@ -28,9 +28,10 @@ class Beam(NamedTuple):
     interior_supports: tuple[int, ...] = ()
     """Nodes, 1 to n - 1, whose deflection is fixed; they rotate freely."""
     torsional_flexibility_per_n: float = 0.0
-    """Ratio e²/(GJ) for wheels whose middle runs at the distance e from the axis (torsion.py)."""
+    """Ratio e²/(GJ) for axles whose centre is at the lateral distance e from the deck's axis
+    (torsion.py); 0: the deck does not twist."""
     torsional_wave_speed_m_per_s: float = 0.0
-    """Speed of torsional waves; positive where the deck twists."""
+    """Speed of torsional waves; must be positive if the deck twists."""
 
 
 class Modes(NamedTuple):
@@ -91,7 +92,7 @@ def span_m(beam: Beam) -> float:
 def element_mass(length_m: float, coupling_sign: float = 1.0) -> FloatArray:
     """Return the consistent mass matrix (4, 4) of a Hermite element of 1 kg/m.
 
-    `coupling_sign` = -1 flips the terms of 13 l/420: an error that reproduces the bridge
+    `coupling_sign` = -1 flips the sign of the terms 13 l/420: an error that reproduces the bridge
     frequencies of the paper's Table 5 (studies/reproduction.md).
     """
     s = length_m
@@ -148,7 +149,7 @@ def _add_block(total: FloatArray, block: FloatArray, dof: NDArray[np.int64]) -> 
 
 
 def mass_matrix(beam: Beam, coupling_sign: float = 1.0) -> FloatArray:
-    """Return the consistent mass matrix (d, d), kg."""
+    """Return the consistent mass matrix (d, d); `coupling_sign` as in `element_mass`."""
     return _assemble(
         [
             rho * element_mass(length, coupling_sign)
@@ -161,10 +162,10 @@ def mass_matrix(beam: Beam, coupling_sign: float = 1.0) -> FloatArray:
 
 
 def unit_stiffness_matrices(element_lengths_m: FloatArray, held: tuple[int, ...]) -> FloatArray:
-    """Return dK/ds_j (n + 4, d, d): of the n flexural rigidities, then of the end springs.
+    """Return dK/ds_j (n + 4, d, d) for the n flexural rigidities, then for the four end springs.
 
     The two rotational springs precede the two vertical ones (zero where the end is fixed). K is
-    exactly the sum of these matrices times s_j. `element_lengths_m` is (n,).
+    exactly the sum over j of s_j times matrix j. `element_lengths_m` is (n,).
     """
     n = element_lengths_m.size
     nodes = node_dofs(n, held)
@@ -228,7 +229,10 @@ def strain_energy_shares(beam: Beam) -> FloatArray:
 def locate_element(
     element_lengths_m: FloatArray, x_m: FloatArray
 ) -> tuple[NDArray[np.int64], FloatArray]:
-    """Return element number (-1 off the bridge) and place 0..1 within it for chainages (…)."""
+    """Return the element index (…), from 0, and the place (…) 0..1 within it for chainages (…).
+
+    Off the bridge the index is -1 and the place 0.
+    """
     edges = np.concatenate([[0.0], np.cumsum(element_lengths_m)])
     element = np.clip(np.searchsorted(edges, x_m, side="right") - 1, 0, element_lengths_m.size - 1)
     place = (x_m - edges[element]) / element_lengths_m[element]
@@ -237,7 +241,7 @@ def locate_element(
 
 
 def cubic_from_nodes(length_m: float) -> FloatArray:
-    """Return the matrix (4, 4) from w_1, theta_1, w_2, theta_2 to the powers 1, xi, xi^2, xi^3."""
+    """Return the matrix (4, 4) from w_1, theta_1, w_2, theta_2 to factors of 1, xi, xi^2, xi^3."""
     s = length_m
     return np.array(
         [
@@ -252,7 +256,10 @@ def cubic_from_nodes(length_m: float) -> FloatArray:
 def element_cubics(
     element_lengths_m: FloatArray, held: tuple[int, ...], nodal: FloatArray
 ) -> FloatArray:
-    """Return cubics (n, 4, k) in the element's place 0..1 of k nodal vectors (d, k)."""
+    """Return the deflection in each element for k nodal vectors (d, k): (n, 4, k).
+
+    These are the factors of the powers 0 to 3 of the place 0..1 within the element.
+    """
     dofs = element_dofs(element_lengths_m.size, held)
     padded = np.vstack([nodal, np.zeros((1, nodal.shape[1]))])  # row -1: fixed deflections
     return np.stack(

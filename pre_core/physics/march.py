@@ -1,4 +1,4 @@
-"""The steps of the coupled forward problem: Newmark's scheme for the truck and for each mode.
+"""Time steps of the coupled forward problem: Newmark's scheme for the truck and for each mode.
 
 Within a step, wheel displacement and contact force are exchanged until the forces converge. Every
 operation is rounded as written: no kernel here allows contraction.
@@ -15,7 +15,10 @@ from pre_core.physics.vehicle import air_spring_excess_n, dahl_friction_n
 
 
 class WheelForces(NamedTuple):
-    """Constants of the forces above and below one axle."""
+    """Constants of the suspension force and the tyre force of one axle, from `HalfCar`.
+
+    `spring_load_n` is the static load on the spring, `static_load_n` that on the road.
+    """
 
     spring_n_per_m: float
     spring_load_n: float
@@ -57,10 +60,10 @@ class WheelTrack(NamedTuple):
     element: NDArray[np.int64]  # (steps, 2): -1 off the bridge
     place: FloatArray  # (steps, 2): 0..1 within the element
     speed: FloatArray  # (steps,)
-    load_transfer: FloatArray  # (steps,)
+    load_transfer: FloatArray  # (steps,): force in N, up on the body's front and down on its rear
     road: FloatArray  # (steps, 2)
     road_rate: FloatArray  # (steps, 2)
-    quasi_static: FloatArray  # (steps or 0, 2, 2): deflection under the wheels by both forces
+    quasi_static: FloatArray  # (steps or 0, 2, 2): m/N, see `torsional_modes.quasi_static_twist`
 
 
 class MarchScheme(NamedTuple):
@@ -88,9 +91,10 @@ class MarchOutputs(NamedTuple):
 def _strut(
     wheel: WheelForces, stroke: float, rate: float, before: float, change: float
 ) -> tuple[float, float]:
-    """Return the force of damper and spring beyond their linear parts, and the friction in it.
+    """Return the nonlinear part of the suspension force, friction included, and the friction alone.
 
-    Positive in extension. `before` is the friction at the last step, `change` that of the stroke.
+    Forces that resist extension are positive. `before` is the friction at the previous step, from
+    which the stroke has changed by `change`.
     """
     strut = wheel.bilinear_n_s_per_m * abs(rate)
     spring = -wheel.spring_n_per_m * stroke
@@ -175,7 +179,7 @@ def march(
         for k in range(count):
             effective[k] = 1.0 if is_given else modal_effective[k]
             if n == bridge.vibration_step:
-                # The position at rest is displaced, too: a wheel that enters passes this step.
+                # Displace q itself, too: `_end_deflection` reads it for a wheel that enters now.
                 q[k] = bridge.vibration[0, k]
                 q_guess[k] = q[k]
                 qd_guess[k] = bridge.vibration[1, k]
@@ -188,8 +192,8 @@ def march(
             was = track.element[n - 1, w] if n > 0 else e
             end_rate[w] = 0.0
             if (e >= 0) != (was >= 0):
-                # The bridge's end is compliant: the wheel passes a step, which its tyre's damper
-                # transmits. A rate at one sample has the impulse of one time step.
+                # On a compliant bearing the road has a step in height, which the tyre's damper
+                # transmits. The rate of one sample has the impulse of the whole step.
                 end = _end_deflection(cubics, max(e, was), q)
                 end_rate[w] = end / step_s if e >= 0 else -end / step_s
             if e >= 0:

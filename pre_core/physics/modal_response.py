@@ -31,11 +31,14 @@ from pre_core.physics.beam_basis import (
 )
 
 COEFFICIENTS = 5
-"""Number of coefficients of a mode: -a_1, -a_2 and b_0, b_1, b_2 over their sum."""
+"""Number of coefficients of a mode: -a_1, -a_2, and b_0, b_1, b_2 divided by the sum of the b."""
 
 
 class LoadedStretch(NamedTuple):
-    """A stretch of samples in which each wheel stays in one part of the bridge."""
+    """Input and output of `advance`: samples during which each wheel stays in one part.
+
+    `deflection` is added to.
+    """
 
     front: int
     """Part under the front wheel; -1 off the bridge."""
@@ -50,7 +53,7 @@ class EndStretch(NamedTuple):
 
     force: FloatArray  # (2 ends, steps): acts in addition to the wheels' forces
     share: FloatArray
-    """Share (2 wheels, 2 ends, steps) of an end's deflection that a wheel follows in addition."""
+    """Share (2 wheels, 2 ends, steps) of an end's deflection that is added to a wheel's."""
 
 
 @inner
@@ -110,11 +113,11 @@ def modal_filters(
 ) -> bool:
     """Compute the recursions of the modes of one bridge `theta` (p,), g groups of four lanes.
 
-    `matrix` and `vectors` are (m, m). Outputs: `filters.cubics` (parts, g, 4, 4) [part, group,
-    power, mode] times the root of the sum of the b; `filters.feedback` (g, 5, 4), whose lanes
-    beyond the last mode stay zero; `modes` (m, 3): omega^2, damping, and the factor from the
-    recursion's q to the coordinate of the mass-normalised mode, with a sign that is the same for
-    similar bridges. Return False if not finite.
+    `matrix` and `vectors` (m, m) are buffers. Outputs: `filters.cubics` (parts, g, 4, 4) [part,
+    group, power, mode], mode shapes times the root of the sum of the b over rho A;
+    `filters.feedback` (g, 5, 4), whose lanes beyond the last mode stay zero; `modes` (m, 3):
+    omega^2, damping, and the factor from the recursion's q to the coordinate of the mass-normalised
+    mode, with a sign that is the same for similar bridges. Return False if a value is not finite.
     """
     if not diagonalise_bridge(basis.stiffness, theta, matrix, vectors):
         return False
@@ -142,7 +145,10 @@ def modal_filters(
 
 @kernel
 def precompensate_force(force: FloatArray, out: FloatArray) -> None:
-    """Write p - (p[n+1] - 2 p[n] + p[n-1])/12 of a force (n,) to `out` (n,); see the module."""
+    """Write p[n] - (p[n+1] - 2 p[n] + p[n-1])/12 of a force p (n,) to `out` (n,).
+
+    This restores what linear interpolation between samples attenuates. The ends stay as they are.
+    """
     last = force.size - 1
     out[0], out[last] = force[0], force[last]
     for n in range(1, last):
@@ -221,7 +227,10 @@ def _no_wheel(feedback: FloatArray, state: FloatArray, steps: int) -> None:
 
 @kernel
 def advance(filters: ModalFilters, wheels: LoadedStretch) -> None:
-    """Advance all modes over a stretch: update `filters.state`, and *add* to the deflections."""
+    """Advance all modes over a stretch: update `filters.state`, and *add* to the deflections.
+
+    Without a wheel on the bridge the modes vibrate freely.
+    """
     cubics, feedback, state = filters.cubics, filters.feedback, filters.state
     place, force, deflection = wheels.place, wheels.force, wheels.deflection
     front, rear = wheels.front, wheels.rear
@@ -242,9 +251,9 @@ def add_free_vibration(
 ) -> None:
     """Add free vibration of mode k to `state`: displacement q and velocity v at the next sample.
 
-    `mode` (3,) is its row of `modal_filters`, `state` (g, 2, 4). The recursion's w is B z^n, z =
-    exp((-s + i w) step), where q[n] = B (n_0 + n_1/z + n_2/z^2) z^n. An overdamped mode stays at
-    rest.
+    `mode` (3,) is its row of the `modes` of `modal_filters`, `feedback` is (g, 5, 4), `state` (g,
+    2, 4). The recursion's w[n] is the real part of B z^n, z = exp((-s + i omega) step), where q[n]
+    is that of B (n_0 + n_1/z + n_2/z^2) z^n. An overdamped mode stays at rest.
     """
     half = 0.5 * mode[1]
     square = mode[0] - half * half
@@ -254,14 +263,14 @@ def add_free_vibration(
     group, lane = k // LANES, k % LANES
     f1, f2 = feedback[group, 0, lane], feedback[group, 1, lane]
     n0, n1, n2 = feedback[group, 2, lane], feedback[group, 3, lane], feedback[group, 4, lane]
-    # z = exp(-s h) (cos + i sin), of which f1 = 2 Re z and f2 = -|z|^2.
+    # From z = exp(-s h) (cos + i sin) follow f1 = 2 Re z and f2 = -|z|^2.
     size = np.sqrt(-f2)
     real = 0.5 * f1
     imaginary = np.sqrt(max(size * size - real * real, 0.0))
     back_r, back_i = real / (size * size), -imaginary / (size * size)  # 1/z
     square_r, square_i = back_r * back_r - back_i * back_i, 2.0 * back_r * back_i
     filter_r, filter_i = n0 + n1 * back_r + n2 * square_r, n1 * back_i + n2 * square_i
-    # A of q(t) = Re A exp((-s + i w) t); then B = A/filter.
+    # Amplitude A in q(t) = Re A exp((-s + i omega) t); then B = A/filter.
     a_r, a_i = q / mode[2], -(v + half * q) / (root * mode[2])
     norm = filter_r * filter_r + filter_i * filter_i
     b_r = (a_r * filter_r + a_i * filter_i) / norm
@@ -313,6 +322,6 @@ def _group_with_ends(
 
 @inner
 def advance_with_ends(filters: ModalFilters, wheels: LoadedStretch, ends: EndStretch) -> None:
-    """Advance as `advance` does, with forces at the ends, whose motion the wheels follow."""
+    """Advance as `advance` does, with forces at the bridge's ends and shares of their motion."""
     for g in range(filters.feedback.shape[0]):
         _group_with_ends(filters, g, wheels, ends)

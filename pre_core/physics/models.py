@@ -1,4 +1,4 @@
-"""Conversion of a truck and a bridge to one parameter vector and back (parameters.py)."""
+"""Conversion of a truck and a bridge to a parameter vector, and of a vector to its bridge."""
 
 import numpy as np
 
@@ -60,7 +60,7 @@ def beam_from(
 
 
 def body_masses(theta: FloatArray, total_mass_kg: float, wheelbase_m: float) -> FloatArray:
-    """Return m_s, m_s1 = m_s d_2/D and m_s2 = m_s d_1/D, shape (…, 3), for vectors (…, p)."""
+    """Return m_s, m_s1 = m_s d_2/D and m_s2 = m_s d_1/D in kg, shape (…, 3), for theta (…, p)."""
     m_s = total_mass_kg - theta[..., M_U1] - theta[..., M_U1 + 1]
     rear = m_s * theta[..., D_1] / wheelbase_m
     return np.stack([m_s, m_s - rear, rear], axis=-1)

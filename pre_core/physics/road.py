@@ -1,8 +1,8 @@
 """Road profiles: generated from an ISO 8608 class, filtered by a tyre, rated (IRI, class).
 
 ISO 8608 describes a profile by the displacement spectral density G_d(n) = G_d(n_0) (n/n_0)^-w, n_0
-= 0.1 cycles/m, w = 2; class A has the geometric mean G_d(n_0) = 16e-6 m^3, each next class four
-times that.
+= 0.1 cycles/m, w = 2; class A has the geometric mean G_d(n_0) = 16e-6 m^3, each further class four
+times that of the previous one.
 """
 
 from typing import NamedTuple
@@ -76,7 +76,7 @@ def contact_patch_average(profile: Profile, length_m: float) -> Profile:
     """
     if length_m <= 0.0:
         return profile
-    from scipy.interpolate import CubicSpline  # slow to import, of drawn roads alone
+    from scipy.interpolate import CubicSpline  # slow to import; only simulated roads need it
 
     x, height = profile.x_m, profile.height_m
     first, last = float(x[0]), float(x[-1])
@@ -93,9 +93,10 @@ def contact_patch_average(profile: Profile, length_m: float) -> Profile:
 
 
 def under_wheels(profile: Profile, motion: Motion, wheelbase_m: float, direction: int) -> WheelRoad:
-    """Return height and rate of change under both wheels, by a cubic spline of the profile.
+    """Return height and rate of change under both wheels (steps, 2), by cubic splines.
 
-    Raise ValueError if the profile does not cover the path of both wheels.
+    `direction` is 1 from the bridge's start to its end, -1 in the other direction. Raise ValueError
+    if the profile does not cover the path of both wheels.
     """
     return under_axles(profile, profile, motion, wheelbase_m, direction)
 
@@ -103,8 +104,8 @@ def under_wheels(profile: Profile, motion: Motion, wheelbase_m: float, direction
 def under_axles(
     front: Profile, rear: Profile, motion: Motion, wheelbase_m: float, direction: int
 ) -> WheelRoad:
-    """Return height and rate of change under both wheels, each axle with its own profile."""
-    from scipy.interpolate import CubicSpline  # slow to import, of drawn roads alone
+    """Return what `under_wheels` does, where each axle has its own profile."""
+    from scipy.interpolate import CubicSpline  # slow to import; only simulated roads need it
 
     behind_m = rear_position_m(motion.position_m, wheelbase_m, direction)
     heights, slopes = [], []
@@ -178,7 +179,7 @@ def iri_m_per_km(profile: Profile, segment_m: float | None = None) -> FloatArray
 
 
 def roughness_coefficient_m3(profile: Profile) -> float:
-    """Return G_d(n_0) of a profile: the level of a line of slope -2 fitted to its spectrum."""
+    """Return G_d(n_0) of a profile: a line of slope -2 fitted to its log-log spectrum."""
     spacing = float(profile.x_m[1] - profile.x_m[0])
     n, density = _welch(
         profile.height_m, spacing, min(profile.height_m.size, round(100.0 / spacing))

@@ -25,7 +25,7 @@ _BLOCK = 2048  # output samples interpolated at once, to bound memory
 
 
 class Accelerometer(NamedTuple):
-    """One channel; the defaults are those of a perfect one at `rate_hz`."""
+    """One channel of an accelerometer; by default a perfect one that samples at `rate_hz`."""
 
     rate_hz: float
     noise_density_ug_per_rthz: float = 0.0
@@ -134,7 +134,7 @@ def resample(samples: FloatArray, rate_hz: float, new_rate_hz: float, delay_s: f
         distance = offsets - place[:, None]
         weight = windowed_sinc(distance, cutoff, half_length, beta)
         weight /= weight.sum(axis=1, keepdims=True)  # preserve a constant
-        values = around[first + (1 - half_length - before)]  # rows at once: a copy of each
+        values = around[first + (1 - half_length - before)]  # one copy of all rows
         result[begin : begin + _BLOCK] = np.einsum("mj,mj->m", weight[which], values)
     return result
 
@@ -171,7 +171,8 @@ def gauss_markov(
     """Return a stationary Gauss-Markov process (n,) at evenly spaced times (n,).
 
     e_k = phi e_(k-1) + sqrt(1 - phi^2) w_k, phi = exp(-dt/correlation): its standard deviation is
-    `spread` and its autocorrelation exp(-|t|/correlation); a constant for an infinite one.
+    `spread` and its autocorrelation exp(-|t|/correlation). An infinite correlation time gives a
+    constant.
     """
     draws = spread * rng.standard_normal(time_s.size)
     if time_s.size < 2:
@@ -194,9 +195,9 @@ def measure_position(
 ) -> SimulatedFixes:
     """Return the fixes of `receiver` on a drive given at increasing times (n,).
 
-    Fixes come every 1/rate from the first time. The earliest is the one whose true time, its stamp
-    minus the latency, is the first within the drive. Random errors continue during an outage, so
-    that an outage changes no other fix.
+    Stamps are every 1/rate from the first time on; a fix whose true time, stamp minus latency, is
+    outside the drive is omitted. Random errors continue during an outage, so that an outage changes
+    no other fix.
     """
     count = int(np.floor((time_s[-1] - time_s[0]) * receiver.rate_hz + 1e-9)) + 1
     stamp = time_s[0] + np.arange(count) / receiver.rate_hz

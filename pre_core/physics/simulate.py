@@ -61,11 +61,14 @@ class InitialVibration(NamedTuple):
 
     state: FloatArray  # (2, modes): displacement and velocity of `bridge.modes`
     step: int | None = None
-    """Step of its beginning; None: entry of the first wheel, or time 0 if none enters."""
+    """Time step at which it begins; None: entry of the first wheel, or step 0 if none enters."""
 
 
 class CoupledResponse(NamedTuple):
-    """Response of truck and bridge; `converged` is False if the forces of a step did not."""
+    """Response of truck and bridge; not `converged` if the forces of a step did not converge.
+
+    Later steps are zero then.
+    """
 
     displacement_m: FloatArray  # (steps, 4): z_s1, z_s2, z_u1, z_u2
     velocity_m_per_s: FloatArray  # (steps, 4)
@@ -74,7 +77,7 @@ class CoupledResponse(NamedTuple):
     wheel_deflection_m: FloatArray  # (steps, 2): the bridge under each wheel
     modal_displacement: FloatArray  # (steps, modes), in bending
     modal_velocity: FloatArray  # (steps, modes)
-    friction_n: FloatArray  # (steps, 2) of the springs, positive where it resists lengthening
+    friction_n: FloatArray  # (steps, 2) of the suspension, positive where it resists extension
     modes: _bridge.Modes
     converged: bool
     iterations: int
@@ -118,9 +121,9 @@ def simulate(
 ) -> CoupledResponse:
     """Drive the truck along `motion` and return accelerations, forces and deflections.
 
-    The truck starts at rest in static equilibrium on a flat road at height zero, without spring
-    friction, and the bridge at rest, unloaded; `swing` is its initial vibration, given for as many
-    modes of this beam as `scheme` has.
+    The truck starts at rest in static equilibrium on a flat road at height zero, without suspension
+    friction. The bridge is at rest and unloaded until `swing`, its initial vibration, begins, which
+    has a state for each of the modes of `scheme`.
 
     Integrating the accelerations by the same scheme from zero gives the displacements to rounding.
     """
@@ -160,7 +163,7 @@ def _truck_matrices(car: _vehicle.HalfCar, step_s: float, gravity_m_per_s2: floa
     effective = mass + 0.5 * step_s * damping + 0.25 * step_s**2 * stiffness
     static_load = _vehicle.static_axle_loads_n(car, gravity_m_per_s2)
     front, rear = (
-        # numba would compile the march again for a whole number among them.
+        # numba would compile `march` again for each combination of integers among them.
         WheelForces._make(
             float(constant)
             for constant in (

@@ -1,8 +1,8 @@
 """Road surfaces: an axle's profile on a surface, and the difference between two axles' profiles.
 
-A tyre averages the road over its width and contact length, an axle over its two wheel tracks, twin
-tyres over two strips each. On an isotropic random surface with the one-sided spectrum Phi(k), k the
-spatial frequency in cycles/m in any direction, an axle multiplies the wave (n_x, n_y) by
+A tyre averages the road over its width and contact length, an axle over its two wheels, a wheel
+with twin tyres over two strips. On an isotropic random surface with the one-sided spectrum Phi(k),
+k the spatial frequency in cycles/m in any direction, an axle multiplies the wave (n_x, n_y) by
 
     H = sinc(width n_y) sinc(length n_x) cos(pi track n_y) cos(pi twins n_y) exp(2 pi i offset n_y)
 
@@ -20,7 +20,7 @@ from pre_core.physics.road import GEOMETRIC_MEAN_M3, REFERENCE_CYCLES_PER_M, Pro
 
 _WIDEST_CYCLES_PER_M = 40.0
 """Largest lateral frequency in cycles/m; tyres average shorter waves out."""
-_AT_ONCE = 32  # waves along whose amplitudes are drawn at once
+_AT_ONCE = 32  # longitudinal waves whose amplitudes are drawn at once
 _ACROSS, _FINE = 400, 4000
 """Number of lateral waves: of a drawn surface, and of the integral to one side."""
 _SHORTEST_WAVE_M, _LONGEST_WAVE_M = 0.05, 100.0
@@ -35,11 +35,11 @@ class Footprint(NamedTuple):
     width_m: float = 0.25
     """Width of a tyre's tread."""
     twin_distance_m: float = 0.0
-    """Distance between the middles of twin tyres; 0 for single ones."""
+    """Distance between the centres of twin tyres; 0 for single tyres."""
     length_m: float = 0.2
     """Length of the contact patch."""
     track_m: float = 1.9
-    """Distance between the middles of the left and right wheels."""
+    """Distance between the centres of the left and right wheels."""
     offset_m: float = 0.0
     """Distance of the axle to the left of the truck's path."""
 
@@ -49,7 +49,7 @@ TYPICAL_FOOTPRINTS = (Footprint(), Footprint(width_m=0.22, twin_distance_m=0.33)
 
 
 def response(axle: Footprint, n_x: FloatArray, n_y: FloatArray) -> ComplexArray:
-    """Return H of the module for waves (…,) along and across the road, in cycles/m."""
+    """Return H (see the module) for waves of n_x along and n_y across the road, (…) in cycles/m."""
     return np.asarray(np.sinc(axle.length_m * n_x) * _strips(axle, n_y))
 
 
@@ -68,8 +68,8 @@ def surface_density(road_class: str) -> float:
 def spectra(front: Footprint, rear: Footprint, n: FloatArray) -> tuple[FloatArray, ...]:
     """Return one-sided spectra (f,) in m³ at n > 0 cycles/m on a surface with Phi k^3 = 1 m².
 
-    These are of the front axle, the rear axle, the real part of their cross spectrum, and their
-    difference front minus rear.
+    These are the spectra of the front axle and of the rear axle, the real part of their cross
+    spectrum, and the spectrum of the difference front minus rear.
     """
     at_front, at_rear, n_y = _patches_and_waves(front, rear, n)
     of_front, of_rear = _strips(front, n_y), _strips(rear, n_y)
@@ -95,9 +95,9 @@ def between_run_cross_spectrum(
 ) -> FloatArray:
     """Return the one-sided cross spectrum (f,) between two runs of the difference in `spectra`.
 
-    The path of each run deviates laterally by a normal of standard deviation `wander_m`, the
-    distance of two by one of sqrt(2) times that: lateral waves are multiplied by exp(-(2 pi n_y
-    w)²).
+    The lateral positions of the runs are normal with the standard deviation `wander_m`, so the
+    distance between two paths has sqrt(2) times that. This multiplies lateral waves by exp(-(2 pi
+    n_y wander)²).
     """
     at_front, at_rear, n_y = _patches_and_waves(front, rear, n)
     both = np.exp(-((2.0 * np.pi * n_y * wander_m) ** 2))
@@ -122,9 +122,10 @@ def _difference(
     apart_rear: FloatArray,
     rear_rear: FloatArray,
 ) -> FloatArray:
-    """Return the integral of |a F - b R|² with D = F - R apart; with equal patches, a² |D|² alone.
+    """Return the integral of |a F - b R|² from those of |D|², Re(D conj R) and |R|², D = F - R.
 
-    The form a² |F|² - 2 a b Re(F conj R) + b² |R|² would cancel: long waves differ by a millionth.
+    The form a² |F|² - 2 a b Re(F conj R) + b² |R|² loses digits by cancellation: for long waves its
+    terms differ by a millionth.
     """
     more = at_front - at_rear
     return at_front**2 * apart_apart + 2.0 * at_front * more * apart_rear + more**2 * rear_rear
@@ -135,8 +136,8 @@ def _integrals(
 ) -> tuple[FloatArray, ...]:
     """Return the integrals (f,) over all n_y of k^-3 times each of `powers` (q,), even in n_y >= 0.
 
-    A sum of even steps in asinh(n_y/scale); the integrands decay like a power. Waves along are
-    processed one at a time: together they would take a hundred megabytes.
+    The sum has even steps in asinh(n_y/scale), because the integrands decay like a power of n_y.
+    Longitudinal waves are processed one at a time: together they would take a hundred megabytes.
     """
     weight = 2.0 * _STEP * np.hypot(_SCALE, n_y)
     weight[0] *= 0.5
@@ -163,9 +164,9 @@ class Surface(NamedTuple):
 def random_surface(
     start_m: float, stop_m: float, spacing_m: float, road_class: str, seed: int
 ) -> Surface:
-    """Return an isotropic surface whose profiles have an ISO 8608 class's geometric mean.
+    """Return an isotropic Gaussian surface with the geometric mean density of an ISO 8608 class.
 
-    It is Gaussian. Longitudinal waves are evenly spaced, their period longer than the patch, so
+    Longitudinal waves are evenly spaced, their period longer than the patch, so
     that it does not repeat; lateral waves are denser where they are long. Waves are between 0.05 m
     and 100 m long.
     """
@@ -192,7 +193,7 @@ def random_surface(
 
 
 def axle_profile(surface: Surface, axle: Footprint, beside_m: float = 0.0) -> Profile:
-    """Return the profile of an axle whose truck drives `beside_m` to the left of the line."""
+    """Return the profile of an axle of a truck that drives `beside_m` to the left of y = 0."""
     moved = axle._replace(offset_m=axle.offset_m + beside_m)
     across = response(moved, np.zeros(1), surface.n_y)
     wave = np.sinc(axle.length_m * surface.n_x) * (surface.amplitude @ across)

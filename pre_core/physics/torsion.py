@@ -35,7 +35,8 @@ MODES = GROUPS * LANES
 class TorsionBasis(NamedTuple):
     """The data that all evaluations of a twisting deck share; empty for one that does not twist.
 
-    `cubics` (parts, 4, modes): unit sines of the part's span in powers of the place 0..1 in it.
+    `cubics` (parts, 4, modes) has unit sines of the part's span, in powers of the place 0..1 within
+    the part.
     """
 
     cubics: FloatArray
@@ -43,7 +44,8 @@ class TorsionBasis(NamedTuple):
     ends_m: FloatArray  # (spans, 2) chainages
     wave_speed_m_per_s: float
     load_factor: float
-    """Factor of g for a crossing at another distance from the axis: the square of their ratio."""
+    """Factor of g for a crossing at another distance from the axis: the squared ratio of the two
+    distances."""
 
 
 NO_TORSION: Final = TorsionBasis(
@@ -58,7 +60,10 @@ def torsion_basis(
     wave_speed_m_per_s: float,
     load_factor: float = 1.0,
 ) -> TorsionBasis:
-    """Return the basis of a deck of parts (parts,), fixed at its ends and at some nodes."""
+    """Return the basis of a deck of parts (parts,) whose twist is fixed at ends and `supports`.
+
+    `supports` are nodes between parts.
+    """
     spans = span_ends_m(part_lengths_m, supports)
     span_of_part = np.searchsorted(np.array(supports), np.arange(part_lengths_m.size), side="right")
     edges = np.concatenate([[0.0], np.cumsum(part_lengths_m)])
@@ -72,7 +77,7 @@ def torsion_basis(
 
 
 def span_ends_m(part_lengths_m: FloatArray, supports: tuple[int, ...]) -> FloatArray:
-    """Return the chainages (spans, 2) of the ends of each span."""
+    """Return the chainages (spans, 2) of each span's ends for parts (parts,) and interior nodes."""
     edges = np.concatenate([[0.0], np.cumsum(part_lengths_m)])
     held = edges[[0, *supports, part_lengths_m.size]]
     return np.stack([held[:-1], held[1:]], axis=1)
@@ -94,10 +99,10 @@ def sine_cubics(part_m: FloatArray, span_m: FloatArray, modes: int) -> FloatArra
 
 
 def mean_receptance(basis: TorsionBasis, theta: FloatArray, omega: FloatArray) -> ComplexArray:
-    """Return the mean receptance (f,) in m of a deck of g = 1/N under an axle, over all places.
+    """Return the receptance (f,) of a deck of g = 1/N at an axle, averaged over the bridge, in m.
 
     It is the deflection by a harmonic force at the same place, at angular frequencies (f,), of the
-    modes and the remainder below with the damping of `theta` (p,); zero for `NO_TORSION`.
+    dynamic modes, damped as by `theta` (p,), and of the quasi-static ones; zero for `NO_TORSION`.
     """
     squared = (1j * omega) ** 2
     lengths = np.diff(basis.ends_m, axis=1)[:, 0]
@@ -122,14 +127,14 @@ def torsion_filters(
     """Write the torsional modes of `theta` (p,) into the last groups, `GROUPS` for each span.
 
     The form is that of `modal_response.modal_filters`: `cubics` (parts, groups, 4, 4) and
-    `feedback` (groups, 5, 4). Return False if not finite.
+    `feedback` (groups, 5, 4). Return False if a value is not finite.
     """
     first = feedback.shape[0] - GROUPS * basis.ends_m.shape[0]
     flexibility = max(theta[TORSION], 0.0) * basis.load_factor
     one = np.empty(COEFFICIENTS)
     for span in range(basis.ends_m.shape[0]):
         length = basis.ends_m[span, 1] - basis.ends_m[span, 0]
-        # The modal mass is that of g = 1/(mass c²), for the coordinate e theta.
+        # In the coordinate e theta a metre of deck has the mass 1/(g c²); a sine moves half of it.
         per_mass = 2.0 * flexibility * basis.wave_speed_m_per_s**2 / length
         for j in range(MODES):
             omega = (j + 1) * np.pi * basis.wave_speed_m_per_s / length
@@ -153,10 +158,10 @@ def torsion_filters(
 def flexibility_remainder(
     basis: TorsionBasis, part: int, place: float, at_m: float, other: int, there: float, to_m: float
 ) -> float:
-    """Return G(x, x') in m between two places, without the part of the dynamic modes.
+    """Return G(x, x') in m between two places, without the share of the dynamic modes.
 
-    A place is its part, the place 0..1 in that, and its chainage; parts of -1 are off the bridge.
-    `basis` holds the spans (spans, 2).
+    Each place is given by its part (-1: off the bridge), the local coordinate 0..1 in this part and
+    the chainage: `part`, `place`, `at_m` and `other`, `there`, `to_m`.
     """
     if part < 0 or other < 0 or basis.span_of_part[part] != basis.span_of_part[other]:
         return 0.0

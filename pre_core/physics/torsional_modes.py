@@ -1,6 +1,6 @@
 """Torsion of the deck for the coupled simulation: many sines of every span, and the remainder.
 
-The equations are those of `torsion`, of which the identification uses eight sines in a coarser
+The equations are those of `torsion`; the identification uses eight sines of each span and a coarser
 mesh.
 """
 
@@ -25,7 +25,7 @@ class TorsionalModes(NamedTuple):
 
 
 def torsional_modes(beam: Beam) -> TorsionalModes:
-    """Return the sines of every span, normalised to the modal mass of e theta.
+    """Return the sines of every span, mass-normalised in the coordinate e theta.
 
     Raise ValueError for a deck that twists without a torsional wave speed.
     """
@@ -50,7 +50,11 @@ def torsional_modes(beam: Beam) -> TorsionalModes:
 
 
 def quasi_static_twist(beam: Beam, wheels_m: FloatArray) -> FloatArray:
-    """Return the quasi-static flexibility (steps, 2, 2) in m/N at the wheels for their loads."""
+    """Return the flexibility (steps, 2, 2) in m/N of all higher modes at wheels (steps, 2).
+
+    Entry i, j is the deflection at wheel i by a unit load on wheel j. A deck that does not twist
+    has no rows: (0, 2, 2).
+    """
     if beam.torsional_flexibility_per_n == 0.0:
         return np.zeros((0, 2, 2))
     out = np.zeros((wheels_m.shape[0], 2, 2))

@@ -1,4 +1,4 @@
-"""The half-car: a rigid body on two axles (paper section 2.1, Table 1), with free pitch inertia.
+"""The half-car: a rigid body on two axles (paper section 2.1, Table 1), with any pitch inertia.
 
 Coordinates are the vertical displacements of the body above the axles and of the axles themselves,
 from the equilibrium on a flat road, up positive: z = [z_s1, z_s2, z_u1, z_u2].
@@ -54,9 +54,9 @@ def total_mass_kg(car: HalfCar) -> float:
 def dahl_friction_n(friction: float, stroke: float, level: float, length: float) -> float:
     """Return the friction after the spring has lengthened by `stroke` (m) from `friction` (N).
 
-    Dahl's law dF/du = (F_c/length) (1 - sign(du) F/F_c), exact for a stroke in one direction; a
-    positive F resists lengthening. Swept between -a and a it encloses 4 F_c (a - length
-    tanh(a/length)).
+    Dahl's law dF/du = (F_c/length) (1 - sign(du) F/F_c), F_c being `level`, exact for a stroke in
+    one direction. A positive F resists extension. A cycle between -a and a dissipates 4 F_c (a -
+    length tanh(a/length)).
     """
     towards = level if stroke >= 0.0 else -level
     return towards + (friction - towards) * np.exp(-abs(stroke) / length)
@@ -97,7 +97,7 @@ def masses_above_axles(
 def masses_on_axles(
     body_mass: float, d_1: float, wheelbase: float, unsprung_1: float, unsprung_2: float
 ) -> tuple[float, float]:
-    """Return the masses on the front and rear axle of the standing truck, wheels included."""
+    """Return the masses on front and rear axle of the standing truck, unsprung ones included."""
     return (
         body_mass * (wheelbase - d_1) / wheelbase + unsprung_1,
         body_mass * d_1 / wheelbase + unsprung_2,
