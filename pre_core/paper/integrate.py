@@ -41,7 +41,7 @@ def newmark_integrate(acceleration: FloatArray, step_s: float) -> IntegratedMoti
 
 def spline_integrate(acceleration: FloatArray, step_s: float) -> IntegratedMotion:
     """Integrate rows of evenly spaced samples (channels, n) twice through a cubic spline."""
-    from scipy.interpolate import CubicSpline  # slow to import, of the paper's method alone
+    from scipy.interpolate import CubicSpline  # slow to import; only the paper's method needs it
 
     t = step_s * np.arange(acceleration.shape[1])
     spline = CubicSpline(t, acceleration, axis=1)

@@ -1,9 +1,9 @@
 """Least squares on the paper's residual: Levenberg-Marquardt in logarithms of the parameters.
 
-Without noise the surface is benign (studies/reproduction.md): from anywhere in the paper's prior
-about ten steps lead to the one minimum. All parameters are positive, so the search moves in
-logarithms and needs no bounds, except that d_1 must lie between the axles: there it
-moves in the logit.
+Without noise the objective is benign (studies/reproduction.md): from anywhere in the paper's prior
+about ten steps lead to its only minimum. All parameters are positive, so the search coordinates are
+logarithms and need no bounds, except that d_1 must lie between the axles: its coordinate is a
+logit.
 """
 
 from typing import NamedTuple
@@ -29,7 +29,7 @@ MAX_STEPS = 60
 
 
 class LeastSquaresProblem(NamedTuple):
-    """The constants of a search: data, all parameters, and the free ones."""
+    """The constants of a search: data, fixed values, and the indices of the free parameters."""
 
     window: PaperWindow
     fixed: FloatArray  # (p,) values of the fixed parameters

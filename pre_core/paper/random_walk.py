@@ -2,8 +2,8 @@
 
 A particle makes a random step if its J does not grow, and stays otherwise (paper eq. 23). The paper
 calls it MCMC, but it does not sample a posterior, because acceptance is not probabilistic. The
-spread of its particles is not an uncertainty: it follows from the width of the step. It is here for
-comparison.
+spread of its particles is not an uncertainty: it follows from the width of the step. The search is
+kept for comparison.
 
 The paper does not print the distribution of the step. Here it is Gaussian with a standard deviation
 of 7 % of the undamaged value, in all coordinates at once (derivation in studies/reproduction.md).
@@ -28,7 +28,7 @@ STEP_RATIO = 0.07
 
 
 class RandomWalkProblem(NamedTuple):
-    """The constants of a search: data, undamaged values, the free ones, a workspace per thread."""
+    """The constants of a search: data, undamaged values, free indices, a workspace per thread."""
 
     window: PaperWindow
     nominal: FloatArray  # (p,)

@@ -45,7 +45,7 @@ class Workspace(NamedTuple):
     state: FloatArray  # (m, 2, 4)
     force: FloatArray  # (2, stretch, 4)
     road: FloatArray  # (2, n, 4): minus the two road profiles
-    seen: FloatArray  # (q, 4): sums of the rows with the nuisance columns
+    seen: FloatArray  # (q, 4): inner products of the residuals and the nuisance columns
 
 
 def workspace(window: PaperWindow) -> Workspace:
@@ -152,11 +152,11 @@ def _all_beyond(values: tuple[float, float, float, float], limit: FloatArray) ->
 def march_four(
     window: PaperWindow, work: Workspace, theta: FloatArray, limit: FloatArray, total: FloatArray
 ) -> None:
-    """Compute J of four vectors `theta` (4, p) to `total` (4,); roads stay in `work.road`.
+    """Write J of four vectors `theta` (4, p) to `total` (4,), and minus the roads to `work.road`.
 
-    An evaluation stops early once the J of every vector has passed its `limit` (4,), which decides
-    a comparison J <= limit exactly; `total` then exceeds the limit. Where J is not finite, `total`
-    is infinite.
+    Without nuisance columns an evaluation stops early once the J of every vector exceeds its
+    `limit` (4,). This decides a comparison J <= limit exactly; `total` then exceeds the limit.
+    Where J is not finite, `total` is infinite.
     """
     total[:] = np.inf
     for i in range(theta.shape[0]):
@@ -372,7 +372,7 @@ def _one_vector_stretch(
 
 
 class ImpliedProfiles(NamedTuple):
-    """The two road profiles that a parameter vector implies, over the compared stretch."""
+    """The two road profiles that a parameter vector implies on the bridge."""
 
     x_m: FloatArray  # (m,)
     front_m: FloatArray  # (m,)
@@ -391,9 +391,9 @@ def road_profiles(window: PaperWindow, work: Workspace, theta: FloatArray) -> Im
 
 
 def deflections_m(window: PaperWindow, theta: FloatArray) -> FloatArray:
-    """Return the deflection (2, n) of the bridge under front and rear wheel, positive downwards."""
+    """Return the deflection (2, n) under front and rear wheel, down positive, for theta (p,)."""
     work = workspace(window)
     four = np.repeat(theta[None, :], LANES, axis=0)
     march_four(window, work, four, np.full(LANES, np.inf), np.empty(LANES))
-    # That array holds minus r, and y = u - r.
+    # `work.road` holds minus r, and y = u - r.
     return np.asarray(-input_profiles(window.signals, theta) - work.road[:, :, 0])

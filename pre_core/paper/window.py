@@ -52,8 +52,8 @@ class MeasuredCrossing(NamedTuple):
 class PaperWindow(NamedTuple):
     """One crossing, prepared for many evaluations.
 
-    n samples from shortly before the first axle enters until the last has left; m residuals while
-    the rear axle is on the compared stretch of road.
+    There are n samples, from shortly before the first axle enters until the last has left, and m
+    residuals, one for each sample with the rear axle on the bridge.
     """
 
     step_s: float

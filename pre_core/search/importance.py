@@ -18,9 +18,10 @@ LogDensity = Callable[[FloatArray], FloatArray]
 """Logarithm of a density (k,) at points (k, d), up to a constant."""
 
 _MAX_ROUNDS, _SAME_SCALE = 50, 1e-6
-"""Limit of the rounds in which densities are scaled alike, and the change that ends them."""
+"""Largest number of rounds that scale the densities to each other, and the change of a log scale
+that ends them."""
 _NOTHING = 1e-300
-"""Density relative to the highest at a point below which it does not matter."""
+"""Density, relative to the highest at the same point, below which it does not matter."""
 
 
 class SmoothedWeights(NamedTuple):
@@ -36,9 +37,9 @@ def mixture_log_weights(
 ) -> FloatArray:
     """Return the log weights (k,) of draws from several densities, as draws of their mixture.
 
-    `log_target` (k,) and `log_density` (k, r) are at all draws, which come in the order of the
-    densities, `counts` (r,) of each. None is normalised: the densities are scaled so that each has
-    its share of the mixture (Shirts and Chodera 2008, equation 11).
+    `log_target` (k,) and `log_density` (k, r) are values at all draws, ordered by the density that
+    they were drawn from, `counts` (r,) of each. Densities need not be normalised: they are scaled
+    so that each has its share of the mixture (Shirts and Chodera 2008, equation 11).
     """
     stops = np.cumsum(counts)
     log_counts = np.log(counts)
@@ -63,16 +64,17 @@ def mixture_log_weights(
 def systematic_resample(
     share: FloatArray, count: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Return `count` shuffled indices (count,), each as often as its `share` (k,)."""
+    """Return `count` shuffled indices (count,) in proportion to the shares (k,)."""
     steps = (np.arange(count) + rng.uniform()) / count
     upto = np.cumsum(share) / np.sum(share)
     return rng.permutation(np.minimum(np.searchsorted(upto, steps), share.size - 1))
 
 
 def pareto_smooth(log_weight: FloatArray) -> SmoothedWeights:
-    """Return Pareto-smoothed weights of log weights (k,); k is infinite if few are finite.
+    """Return Pareto-smoothed weights of log weights (k,).
 
-    Where the largest are equal there is no tail to fit, and k is zero.
+    If too few are finite, the weights are equal, `pareto_k` is infinite and `ess` zero. If the
+    largest are equal, there is no tail to fit, and `pareto_k` is zero.
     """
     count = log_weight.size
     tail = int(np.ceil(min(0.2 * count, 3.0 * np.sqrt(count))))
@@ -98,7 +100,7 @@ def _quantiles(part: FloatArray, k: float, scale: float) -> FloatArray:
 def _generalised_pareto(x: FloatArray) -> tuple[float, float]:
     """Return shape k and scale of x (n,) > 0, ascending (Zhang and Stephens 2009).
 
-    A prior of ten draws at one half stabilises the shape of few.
+    A prior worth ten draws with k = 1/2 stabilises the shape for small n.
     """
     n = x.size
     points = 30 + int(np.sqrt(n))

@@ -11,18 +11,20 @@ from pre_core.arrays import FloatArray
 class LatentCoordinates(NamedTuple):
     """Normal coordinates v of values y, some of which must not be negative and may be zero.
 
-    A value that may be zero is zero for any v below zero; one that is never zero is |v|. All values
-    follow those: v is what they do not explain. So a value that becomes zero takes its correlated
-    ones along, and no further: without this, moves of v hardly ever reach zero and return.
+    A value that may be zero is max(v, 0); one that is never zero is |v|. All values depend linearly
+    on these, by `follow`, and their v is the remainder. So correlated values move with a value
+    until it reaches zero, and then stay: without this, moves of v hardly ever reach zero and
+    return.
     """
 
     places: NDArray[np.int64]
-    """Indices (p,) of the values that must not be negative; each follows those before it."""
-    log_odds: FloatArray  # (p,) of zero, against the density per unit
+    """Indices (p,) of the values that must not be negative; each depends on those before it."""
+    log_odds: FloatArray
+    """Logarithm (p,) of the probability of zero relative to the density per unit at zero."""
     scale: FloatArray
-    """Spreads (p,) of v below zero, where its density is normal: about those of the values above,
-    because moves of one length explore both."""
-    follow: FloatArray  # (b, p) slopes of all values along those of `places`
+    """Standard deviations (p,) of v below zero, where its density is half-normal: about those of
+    the positive values, so that moves of one length explore both sides."""
+    follow: FloatArray  # (b, p) derivatives of all values with respect to those of `places`
 
     def values(self, v: FloatArray) -> FloatArray:
         """Return the values (k, b) of coordinates v (k, b)."""
@@ -33,7 +35,7 @@ class LatentCoordinates(NamedTuple):
         return y
 
     def log_share(self, v: FloatArray) -> FloatArray:
-        """Return the log density (k,) of v (k, b) relative to that of the values."""
+        """Return the log (k,) of the density of v (k, b) over that of its values."""
         y, share = v.copy(), np.zeros(v.shape[0])
         for number, place in enumerate(self.places):
             odds, scale = self.log_odds[number], self.scale[number]
@@ -48,7 +50,7 @@ class LatentCoordinates(NamedTuple):
         return share
 
     def unexplained(self, values: FloatArray) -> FloatArray:
-        """Return the coordinates (b, n) of changes (b, n) of positive values: v is linear there."""
+        """Return the changes (b, n) of v for changes (b, n) of positive values: v is linear."""
         return np.asarray(values - self.follow @ values[self.places])
 
 
@@ -57,8 +59,8 @@ def latent_coordinates(
 ) -> LatentCoordinates:
     """Return coordinates for values with about this mean (b,) and covariance (b, b).
 
-    `places` (p,) must not be negative; `log_odds` (b,) are those of zero, against the density per
-    unit: minus infinity where a value is never zero, infinity where it always is.
+    Values at the indices `places` (p,) must not be negative; `log_odds` (b,) as in
+    `LatentCoordinates`: minus infinity where a value is never zero, infinity where it always is.
     """
     spread = np.sqrt(np.diag(covariance)[places])
     order = places[np.argsort(mean[places] / spread, kind="stable")]
@@ -67,9 +69,9 @@ def latent_coordinates(
     for number, place in enumerate(order):
         slope = left[:, place] / left[place, place]
         left -= np.outer(slope, left[place])
-        # Those before it, and itself, have nothing left to follow.
+        # Earlier values, and this one itself, do not depend on it.
         slope[order[: number + 1]] = 0.0
-        # What a value itself follows, its followers no longer follow directly.
+        # The indirect dependence on earlier values, through this one, is not counted twice.
         follow[:, :number] -= np.outer(slope, follow[place, :number])
         follow[:, number] = slope
     return LatentCoordinates(order, log_odds[order], np.sqrt(np.diag(covariance)[order]), follow)

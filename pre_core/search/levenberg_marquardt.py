@@ -23,7 +23,7 @@ _CONVERGED_STEP = 1e-9  # in logarithms
 _KEPT = 0.5
 """Smallest improvement, relative to its prediction, for which an updated Jacobian is kept."""
 _MISFIT_IMPROVEMENT = 1e-3
-"""Improvement relative to the objective that ends the search at a misfit."""
+"""Improvement, relative to the objective, below which a search with a large misfit ends."""
 _LARGEST_STEP = 1.0  # in logarithms: nothing changes by more than a factor of e in one step
 
 
@@ -53,7 +53,7 @@ sixth degree. With this step the formula's error and rounding are similar."""
 
 
 class LMState(NamedTuple):
-    """State of the search: `y` are the transformed free parameters (f,)."""
+    """State of the search at the search coordinates `y` (f,)."""
 
     y: FloatArray
     residual: FloatArray  # (m,)
@@ -181,7 +181,7 @@ def _follow(rows: Rows, state: LMState, lower: FloatArray | None) -> tuple[LMSta
     following = state._replace(
         y=there.y,
         residual=there.residual,
-        # Column by column, as the Jacobian stands.
+        # Transposed, to keep the Jacobian's memory order.
         jacobian=state.jacobian + np.outer(change / max(_square(change), 1e-300), missed).T,
         objective=there.objective,
         damping=there.damping,
@@ -268,12 +268,13 @@ def minimise(
 ) -> SearchResult[LMState, LMInfo]:
     """Return the minimum near `start` (f,), reached when a step improves by less than `enough`.
 
-    Where the mean square of the residuals exceeds `misfit`, an improvement by less than a
-    thousandth of the objective also ends the search: its exact minimum is not needed. Where no step
-    helps, forward differences have reached their rounding, which counts as a minimum. With
-    `is_followed` the Jacobian is computed at the start, and then only where updates (`_follow`)
-    fail. A step that improves too little ends the search only with a fresh Jacobian. The Jacobian
-    at the end need not be fresh (`LMState.is_fresh`). No coordinate goes below `lower` (f,).
+    At most `steps` steps are taken. Where the mean square of the residuals exceeds `misfit`, an
+    improvement by less than a thousandth of the objective also ends the search: its exact minimum
+    is not needed. Where no step helps, forward differences have reached their rounding, which
+    counts as a minimum. With `is_followed` the Jacobian is computed at the start, and then only
+    where updates (`_follow`) fail. A step that improves too little ends the search only with a
+    fresh Jacobian. The Jacobian at the end need not be fresh (`LMState.is_fresh`). No coordinate
+    goes below `lower` (f,).
     """
 
     def step(state: LMState) -> tuple[LMState, LMInfo]:

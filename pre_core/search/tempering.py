@@ -3,8 +3,8 @@
 A population follows a path of densities from a wide normal to the target (Del Moral, Doucet and
 Jasra 2006). Each step to the next density leaves half of the draws effective (Jasra et al. 2011),
 resamples them, and moves each by differences of others (ter Braak 2006), which follow the scales
-and directions of the population by themselves. Moves of few coordinates are of those in which the
-first normal is white.
+and directions of the population by themselves. Some moves change few coordinates, of those in which
+the first normal is white.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ from pre_core.search.importance import LogDensity
 _EFFECTIVE_SHARE = 0.5
 """Effective share of the draws after a step to the next density."""
 _HALVINGS = 40
-"""Halvings of the interval that contains this step."""
+"""Number of bisections by which this step is found."""
 _MOVES = 6
 """Number of moves of every draw at each density."""
 _MAX_STEPS = 60
@@ -31,8 +31,8 @@ _STEP_SPREAD = 0.4
 _WHOLE = 0.1
 """Share of moves by a whole difference, from peak to peak."""
 _FEW, _FEWER = 0.4, 2.0
-"""Share and mean number of the coordinates in every third move each, which leave the others: the
-one follows bends, the other reaches values that are zero or not."""
+"""Share of the coordinates that one move of three changes, and mean number that another changes:
+the first follows curved peaks, the second switches values between zero and positive."""
 
 
 class _Population(NamedTuple):
@@ -55,10 +55,10 @@ def tempered_draws(
     rng: np.random.Generator,
     progress: Callable[[float], object] = lambda done: None,
 ) -> FloatArray:
-    """Return draws (len(moves) * count, d) of a density, from a normal that is wider.
+    """Return draws (len(moves) * count, d) of the density `target`, starting from a wider normal.
 
-    The normal has the `mean` (d,) and the `covariance` (d, d). `moves` are the
-    numbers of moves of every draw at the target before each snapshot. Draws of a snapshot are
+    The normal has the `mean` (d,) and the `covariance` (d, d). Each entry of `moves` gives a
+    snapshot of `count` draws: the number of moves at the target before it. Draws of a snapshot are
     independent of each other except for resampling. `progress` is called with the completed share.
     """
     root = np.asarray(np.linalg.cholesky(covariance))
