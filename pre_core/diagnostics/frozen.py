@@ -1,9 +1,9 @@
 """Stretches of a signal without a measurement: held at one value, or interpolated linearly.
 
 Noise and motion change every sample and every difference of samples, but a coarse converter often
-gives equal neighbours. A stretch counts if it is longer than chance produces in one of a thousand
-million records. A held one also requires that the signal then jumps by more than the converter's
-steps, which does not happen to a signal that merely stays within one step.
+gives equal neighbours. A stretch counts if it is longer than chance produces in one of a hundred
+thousand records. After a held stretch of a coarse signal, the signal must also jump by several
+steps of the converter: a signal that merely stays within one step does not.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pre_core.arrays import FloatArray
 
 _SHORTEST_S, _LONG_S = 0.01, 0.04
-"""Shortest stretch that counts, and shortest held one that counts whatever the share of equal
+"""Shortest stretch that counts, and shortest held stretch that counts for any share of equal
 neighbours."""
 _FEWEST = 5
 """Fewest samples of a stretch that counts."""
@@ -23,21 +23,21 @@ _COARSE_SHARE = 0.02
 _JUMP = 4.0
 """Smallest jump after a held stretch, in steps of the converter."""
 _LOW_STEPS = 0.05
-"""Quantile of the changes of a coarse signal that equals one step."""
+"""Probability of the quantile that estimates one step from the changes of a coarse signal."""
 _STRAIGHT = 1e-3
-"""Largest second difference on a line, relative to the median one."""
+"""Largest second difference on a line, relative to the median second difference."""
 _ON_GRID = 1e-3
 """Tolerance of changes of a quantised signal, relative to a step."""
 _ROUNDING = 1e-9
 """Floating-point tolerance, relative to the largest value."""
 _BLOCKS = 8
-"""Number of parts of a record: in calm ones more neighbours are equal."""
+"""Number of parts of a record, each with a share of equal neighbours: calm parts have more."""
 
 
 def longest_hold_s(values: FloatArray, step_s: float) -> float:
-    """Return the duration of the longest stretch of (n,) with one value; 0 without one.
+    """Return the duration in s of the longest stretch of a signal (n,) with one value, or 0.
 
-    Both ends of the range are excluded, where a sensor is saturated and not stuck.
+    The largest and the smallest value are excluded: there a sensor is saturated, not stuck.
     """
     change = np.diff(values)
     is_equal = change == 0.0
@@ -57,7 +57,7 @@ def longest_hold_s(values: FloatArray, step_s: float) -> float:
 
 
 def longest_line_s(values: FloatArray, step_s: float) -> float:
-    """Return the duration of the longest stretch of (n,) that is a sloping line; 0 without one."""
+    """Return the duration in s of the longest sloping line in a signal (n,), or 0."""
     change = np.diff(values)
     bend = np.abs(np.diff(change))
     is_bent = bend > _ROUNDING * np.abs(values).max()
@@ -91,7 +91,7 @@ def _runs(is_true: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int
 def _largest_share(
     is_true: NDArray[np.bool_], begin: NDArray[np.int64], length: NDArray[np.int64]
 ) -> float:
-    """Return the largest share of true flags (n,) in a part of them, without the longest run."""
+    """Return the largest share of true flags (n,) in a part of it, but for its longest run."""
     worst = int(np.argmax(length))
     others = is_true.astype(np.float64)
     others[begin[worst] : begin[worst] + length[worst]] = 0.0

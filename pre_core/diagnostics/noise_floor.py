@@ -1,9 +1,9 @@
 """The noise density of an accelerometer, from a stretch of its samples.
 
-At standstill a sensor's output is nearly all noise; lines of an engine are few, and the median over
-frequencies ignores them. While driving, only frequencies above the wheels' motion are noise, which
-needs at least 400 Hz. Even there the road remains between the frequencies at which a tyre's contact
-length is a whole number of wavelengths, so the quietest part of the band bounds the noise.
+At standstill a sensor's output is nearly all noise; an engine adds few spectral lines, which the
+median over frequencies ignores. While driving, only frequencies above the wheels' motion are noise,
+which needs at least 400 Hz. Even there the road remains between the frequencies at which a tyre's
+contact length is a whole number of wavelengths, so the quietest part of the band bounds the noise.
 """
 
 from typing import Final, NamedTuple
@@ -16,14 +16,17 @@ from pre_core.constants import MICRO_G_M_PER_S2
 _PIECE_S: Final = 1.0
 _FEWEST_PIECES: Final = 5
 _STANDING_BAND_HZ: Final = 20.0
+"""Lower end of the band at standstill."""
 _DRIVING_BAND: Final = 0.3
+"""Lower end of the band while driving, as a share of the sampling rate."""
 _TOP_OF_BAND: Final = 0.42
-"""Share of the rate above which a sensor's own filter removes its noise."""
+"""Upper end as a share of the sampling rate: above it a sensor's own filter removes its noise."""
 _MEDIAN_OF_POWER: Final = 0.71
-"""Ratio of the median over a dozen pieces to the mean; ln 2 for very many pieces."""
+"""Ratio of the median power over a dozen pieces to the mean; ln 2 for very many pieces."""
 _PARTS: Final = 6
 _LEAST_OF_POWER: Final = 0.79
-"""Ratio of the least of the parts' medians to the whole band's in white noise of ten pieces."""
+"""Ratio of the smallest median of a part of the band to the whole band's, in ten pieces of white
+noise."""
 _WHEELS_HZ: Final = 120.0
 """Frequency above which wheel hop and vibration of frames and brackets have died away."""
 
@@ -64,7 +67,7 @@ def density(still: NoiseSegment) -> Density | None:
     power = np.abs(np.fft.rfft(centred, axis=1)) ** 2
     power *= 2.0 / (still.rate_hz * float(window @ window))
     frequency = np.fft.rfftfreq(size, 1.0 / still.rate_hz)
-    # An impact is in some pieces, an engine's line at some frequencies: medians see neither.
+    # An impact is in some pieces, an engine's line at some frequencies: medians ignore both.
     typical = np.median(power, axis=0) / _MEDIAN_OF_POWER
     edges = np.searchsorted(frequency, np.linspace(low, high, _PARTS + 1))
     parts = [float(np.median(part)) for part in np.split(typical, edges)[1:-1]]

@@ -1,4 +1,4 @@
-"""Statistics of signals and residuals that decide whether an answer is reliable; no verdicts.
+"""Statistics of signals and residuals that decide whether a result is reliable; no verdicts.
 
 Before the fit, from four accelerations alone: whether a channel is stuck or saturated, and whether
 the channels satisfy the body equation, which has no unknown input. After it, from the whitened
@@ -18,9 +18,9 @@ from pre_core.diagnostics.converter import converter_step
 _BODY_BAND_HZ = (0.7, 10.0)
 """Band in which bodies vibrate on their springs; wheels hop above it."""
 _BODY_FACTOR = 4.0
-"""Range of k/m and c/m: a factor in both directions."""
+"""Largest ratio of k/m and of c/m to their known values, and of the known k/m to k/m."""
 _LARGEST_COUPLING = 0.6
-"""Largest absolute coupling of a pair through the pitch inertia."""
+"""Largest absolute coupling m_12/m of front and rear through the pitch inertia."""
 _SAME = 1e-6
 """Relative tolerance within which two channel assignments explain equally well."""
 
@@ -44,7 +44,7 @@ def longest_hold(values: FloatArray) -> int:
 
 
 def smallest_difference(signals: FloatArray) -> float:
-    """Return the smallest RMS difference of two of the signals (c, n), relative to their RMS."""
+    """Return the smallest RMS difference of two signals of (c, n), relative to both's joint RMS."""
     smallest = np.inf
     for i in range(signals.shape[0]):
         for j in range(i):
@@ -73,20 +73,21 @@ class SaturationEvidence(NamedTuple):
     """Accumulation of a signal's values at an end of its range; see `pile_up`."""
 
     ratio: float
-    """Samples in the fullest outer bin over the mean of the adjacent bins."""
+    """Number of samples in the fullest outer bin, divided by the mean of five bins inside it."""
     visits: int
-    """Number of separate times at this level."""
+    """Number of separate stays in this bin or beyond it."""
     level: float
+    """Middle of this bin, relative to the signal's median."""
 
 
 def pile_up(values: FloatArray) -> SaturationEvidence:
     """Return how strongly a signal (n,) piles up at an end of its range, as when saturated.
 
-    The density of an unsaturated signal decreases towards its ends: a smooth peak spends most of
-    its time at its top, yet in the uppermost hundredth only 2.4 times as long as in the next. A
-    saturated signal spends in the last bin all the time that it should have been beyond. The worse
-    of both ends is returned. Bins are at least as wide as the steps of a converter, otherwise some
-    would hold two values and some none.
+    The density of an unsaturated signal decreases towards its ends: even a smooth peak stays in its
+    uppermost hundredth only 2.4 times as long as in the next. A saturated signal stays in the last
+    bin for all the time that it should have been beyond. The worse of both ends is returned. Bins
+    are at least as wide as the steps of a converter; otherwise some would hold two values and some
+    none.
     """
     centred = values - np.median(values)
     step = converter_step(values)
@@ -160,8 +161,9 @@ def assign_channels(
     """Test the order and the signs of four accelerations (4, n) by the body equations.
 
     a_s + (c/m)(v_s - v_u) + (k/m)(z_s - z_u) + (m_12/m) a_s,other = 0 holds for the right channels
-    on any road and bridge, and for hardly any others. c/m and k/m (2,) are free within a factor of
-    4 of their known values (front, rear), the coupling within 0.6. The band is 0.7 to 10 Hz.
+    on any road and bridge, and for hardly any others. k/m is free within a factor of 4 of its known
+    value, c/m from 0 to 4 times its known value, the coupling m_12/m within 0.6. Known values are
+    (2,), front and rear. The band is 0.7 to 10 Hz.
     """
     spectrum, omega = _spectrum(acceleration_m_per_s2, step_s, _BODY_BAND_HZ)
     left: dict[tuple[int, int, int, int, bool], float] = {}
@@ -206,7 +208,7 @@ def unexplained_by_axle(
     stiffness_per_mass: FloatArray,
     damping_per_mass: FloatArray,
 ) -> tuple[float, float]:
-    """Return `ChannelAssignment.upright` of channels (4, n), without testing other orders."""
+    """Return `ChannelAssignment.upright` of channels (4, n); other orders are not tested."""
     spectrum, omega = _spectrum(acceleration_m_per_s2, step_s, _BODY_BAND_HZ)
     front, rear = (
         _unexplained(
@@ -234,7 +236,7 @@ def stiffness_per_mass(
 ) -> tuple[float, float]:
     """Return k/m in 1/s² of front and rear from the body equations of accelerations (4, n).
 
-    They lie within a factor of 4 of the known ones (2,), as in `assign_channels`.
+    Known values (2,) bound the fit as in `assign_channels`.
     """
     spectrum, omega = _spectrum(acceleration_m_per_s2, step_s, _BODY_BAND_HZ)
     found = [
@@ -322,7 +324,7 @@ def bounded_least_squares(
     for is_free in product((True, False), repeat=k):  # all of them first
         free = np.array(is_free)
         ends = [(np.nan,) if one else (low[i], high[i]) for i, one in enumerate(is_free)]
-        x = np.array(list(product(*ends))).T  # (k, faces): those with the same free coordinates
+        x = np.array(list(product(*ends))).T  # (k, faces): all with the same free coordinates
         if free.any():
             rest = image[:, None] - triangle[:, ~free] @ x[~free]
             x[free] = np.linalg.lstsq(triangle[:, free], rest, rcond=None)[0]
@@ -341,7 +343,7 @@ def bounded_least_squares(
 
 
 class ResidualBin(NamedTuple):
-    """Whitened residuals of one kind, segment of the drive and band."""
+    """Whitened residuals of one kind, segment of the drive and band: mean square and number."""
 
     mean_square: float
     size: int
@@ -363,10 +365,10 @@ def residual_bins(
 ) -> dict[tuple[int, int, int], ResidualBin]:
     """Return mean squares of whitened residuals (m, kinds) by kind, segment and band.
 
-    `stretches` (m,) numbers contiguous segments. Each is transformed to its cosine transform, which
-    is orthogonal: with white residuals of unit variance every coefficient is a standard normal, and
-    coefficient k of n belongs to the frequency k/(2 n step). Bands lie between consecutive
-    `edges_hz`.
+    `stretches` (m,) has the number of the segment of each row. The cosine transform of a segment is
+    orthogonal: for white residuals of unit variance every coefficient is a standard normal, and
+    coefficient k of n belongs to the frequency k/(2 n step). Band b lies between `edges_hz` b and b
+    + 1.
     """
     found: dict[tuple[int, int, int], ResidualBin] = {}
     for stretch in np.unique(stretches).tolist():
@@ -384,7 +386,7 @@ def residual_bins(
 
 
 def cosine_transform(rows: FloatArray) -> FloatArray:
-    """Return the orthogonal cosine transform (DCT-II) of columns (n, c), periodic or not.
+    """Return the orthogonal cosine transform (DCT-II) of columns (n, c).
 
     It is the Fourier transform of the columns and their mirror image. (scipy.fft has it, and takes
     longer to import than this takes.)

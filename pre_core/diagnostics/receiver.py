@@ -19,8 +19,9 @@ def speed_scale(
 ) -> tuple[float, float]:
     """Return the relative excess of the speeds over the positions, and its standard deviation.
 
-    Positions (m,) are a + b times the integrated speeds (m,), with white noise and a slow error of
-    exponential correlation. Fewer than four fixes: zero with an infinite standard deviation.
+    Positions (m,) are modelled as a + b times the integral of the speeds (m,), plus white noise
+    with the standard deviation `noise_m` and an exponentially correlated error with `spread_m`. For
+    fewer than four fixes the excess is zero and its standard deviation infinite.
     """
     if time_s.size < _FEWEST:
         return 0.0, np.inf

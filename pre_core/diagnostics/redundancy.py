@@ -7,8 +7,7 @@ combination: it reveals a gain error of about 5 %, and a delay of some ms.
 
 It reveals neither errors that all sensors of a part share, nor whether a gain is wrong or another
 sensor with equal motion has the opposite error; then both are named. A frame that twists also
-shows, and is not a fault: a part that no sensor's gain and delay explains counts only if it is
-large.
+shows, and is not a fault: power that no sensor's gain and delay explain counts only if it is large.
 
 Left and right on an axle are not redundant: their difference is the axle's roll, which near wheel
 hop is several times its heave. Only a loose physical bound holds: one side does not move several
@@ -27,21 +26,21 @@ _BAND_HZ = (0.7, 12.0)
 
 
 class RedundancyResidual(NamedTuple):
-    """Power of the motion-free combinations, in units of their noise."""
+    """Power of the motion-free combinations, in units of their noise density."""
 
     power: float
-    """Mean square of the combinations in the band."""
+    """Sum of squares of the combinations over the band."""
     expected: float
-    """Mean square from noise, gains and delays within their spreads, at `slack` deviations."""
+    """Sum of squares that noise, gains and delays cause at `slack` standard deviations."""
     motion: float
-    """Mean square if all sensors moved independently."""
+    """Sum of squares if all sensors moved independently."""
     unexplained: FloatArray
-    """Share (m,) of the power that one sensor's gain and delay do not explain; NaN for other
-    sensors."""
+    """Share (m,) of the power that a gain error and a delay of this sensor alone do not explain;
+    NaN for sensors outside the part."""
     gain: FloatArray
-    """Relative error (m,) of that gain."""
+    """Relative gain error (m,) in that fit."""
     delay_s: FloatArray
-    """Delay (m,) of that sensor, positive if late."""
+    """Delay (m,) in that fit, positive if late."""
 
 
 def redundancy_residual(
@@ -54,7 +53,8 @@ def redundancy_residual(
 ) -> RedundancyResidual:
     """Return the power of combinations `parity` (r, m) of accelerations (m, n), and its limit.
 
-    The combinations have unit one-sided noise density.
+    `parity` is scaled such that the combinations have unit one-sided noise density. The spreads are
+    standard deviations of gain and delay.
     """
     spectrum, omega = _spectrum(acceleration, step_s)
     rate = 1j * omega * spectrum
@@ -79,7 +79,7 @@ def redundancy_residual(
 
 
 def motion_ratio(one: FloatArray, other: FloatArray, step_s: float) -> float:
-    """Return the ratio of the larger to the smaller motion of two signals (n,)."""
+    """Return the ratio, 1 or more, of the RMS of two signals (n,) in the band."""
     spectrum, _ = _spectrum(np.stack([one, other]), step_s)
     power = np.sum(np.abs(spectrum) ** 2, axis=1)
     return float(np.sqrt(power.max() / power.min())) if power.min() > 0.0 else np.inf
@@ -90,7 +90,7 @@ def _power(values: NDArray[np.complex128]) -> float:
 
 
 def _spectrum(signals: FloatArray, step_s: float) -> tuple[NDArray[np.complex128], FloatArray]:
-    """Return spectra (m, k) in the band, of unit power for unit one-sided density, and omega."""
+    """Return spectra (m, k) in the band, whose power is the one-sided density, and omega (k,)."""
     size = signals.shape[1]
     window = np.hanning(size)
     centred = window * (signals - signals.mean(axis=1, keepdims=True))

@@ -1,4 +1,4 @@
-"""Correlation of motions at the same place of the road: which of two readings meets it first."""
+"""Correlation of motions at the same place of the road, which shows which sensor is in front."""
 
 import numpy as np
 
@@ -20,8 +20,8 @@ def axle_correlation(
     """Return the correlation of both axles' motion at the same place, as recorded and swapped.
 
     Below 8 Hz an axle follows the road. `travelled_m` (n,) is the increasing distance of the front
-    axle at every sample (n,); the rear axle is where the front axle was a wheelbase before. With
-    the axles swapped, the one that is named rear is in front.
+    axle at every sample of both accelerations (n,); the rear axle is a wheelbase behind it. Swapped
+    means that the accelerometer recorded as rear is in front.
     """
     smooth = _band_passed(np.stack([front_m_per_s2, rear_m_per_s2]), step_s, _ROAD_BAND_HZ)
     return (
@@ -38,10 +38,11 @@ def sprung_correlation(
     ahead_m: float,
     spring: tuple[float, float],
 ) -> float:
-    """Return the correlation of a body with a mass on a spring that meets the same road.
+    """Return the correlation of a body's motion (n,) with that of a mass on a spring.
 
-    The road is that of an axle `ahead_m` behind the body's own, which has no sensor; `spring` is
-    stiffness and damping over mass, in 1/s² and 1/s. `travelled_m` (n,) as in `axle_correlation`.
+    The mass is driven by the road that an axle `ahead_m` behind the body's own axle follows, at the
+    same place: the own axle has no sensor. `spring` is stiffness and damping over mass, in 1/s² and
+    1/s. `travelled_m` (n,) as in `axle_correlation`.
     """
     stiffness, damping = spring
     n = axle_m_per_s2.size
@@ -63,7 +64,7 @@ def _band_passed(signals: FloatArray, step_s: float, band_hz: tuple[float, float
 def _correlation(
     front: FloatArray, rear: FloatArray, travelled_m: FloatArray, rear_offset_m: float
 ) -> float:
-    """Return the correlation at the same place of signals whose places differ by an offset."""
+    """Return the correlation at the same place of two signals whose sensors are an offset apart."""
     rear_at = travelled_m + rear_offset_m
     low, high = max(travelled_m[0], rear_at[0]), min(travelled_m[-1], rear_at[-1])
     if high - low < 2.0 * abs(rear_offset_m):

@@ -1,7 +1,7 @@
 """Probability of detecting a loss of rigidity, for a given probability of a false alarm.
 
-The test is one of an element's compliance c = EI_nominal/EI, one-sided. Without a prior of its own
-the data give a normal about the truth (`crossing.compliances`), with all other parameters
+The test of an element is one-sided in its compliance c = EI_nominal/EI. Without a prior of this
+element, the data give a normal about the truth (`crossing.compliances`), with all other parameters
 integrated out. An alarm is raised where c exceeds one by more than chance allows. For any prior of
 the element, this is where the posterior probability that it is weaker than nominal passes a limit.
 A loss L changes c from 1 to 1/(1 - L).
@@ -24,16 +24,16 @@ class DetectionErrors(NamedTuple):
     """Standard deviations (e,) of the test quantities, in 1/EI relative to nominal."""
 
     of_nominal: FloatArray
-    """Error of an element relative to its nominal value, including the error common to all
+    """Error of an element compared with its nominal value, including the error common to all
     elements."""
     of_others: FloatArray
-    """Error of an element relative to the mean of the others, which share that error."""
+    """Error of an element compared with the mean of the others; the common error cancels."""
 
 
 def detection_errors(
     known: BridgePrior, precision: FloatArray, scale_error: float
 ) -> DetectionErrors:
-    """Return the test errors of a survey of this precision (b, b).
+    """Return the standard errors of the tests of a survey with this precision (b, b).
 
     `scale_error` is the relative error common to all EI. Parameters that may be absent count as
     normal with their prior's second moment.

@@ -41,7 +41,7 @@ _SEED = 1
 
 
 class PosteriorAtTruth(NamedTuple):
-    """A crossing's posterior with y (f,) at the truth."""
+    """The posterior of a simulated crossing, and its true search coordinates y (f,)."""
 
     problem: posterior.PosteriorProblem
     y: FloatArray
@@ -52,7 +52,7 @@ class BridgePrior(NamedTuple):
 
     sigma: FloatArray  # (e,) spread of ln EI
     half_normal: NDArray[np.int64]
-    """Indices of parameters that are not negative."""
+    """Indices of the parameters with half-normal priors at zero."""
     log_odds: FloatArray
     """Log odds (b,) of absence, as in `posterior.log_odds_of_absence`."""
     second_moment: FloatArray  # (b - e,) of the priors of all but the elements
@@ -62,8 +62,8 @@ class PlannedPathGroup(NamedTuple):
     """One wheel-path group; each of its planned crossings is repeated equally often."""
 
     precisions: tuple[FloatArray, ...]
-    """Precisions (b + k, b + k): the bridge's parameters, then the shared mismatch in mm at k
-    knots."""
+    """Precision (b + k, b + k) of each crossing: the bridge's parameters, then the shared mismatch
+    in mm at k knots."""
     common: FloatArray | None
     """Prior precision (k, k) of the shared mismatch; None where runs share nothing."""
 
@@ -84,7 +84,10 @@ def bridge_prior(problem: posterior.PosteriorProblem) -> BridgePrior:
 def planned_path_group(
     truths: Sequence[PosteriorAtTruth], whole: Mismatch, wander_m: float
 ) -> PlannedPathGroup:
-    """Return the information of a wheel-path group; its runs wander by `wander_m` (std)."""
+    """Return the information of a wheel-path group whose runs have a lateral wander of `wander_m`.
+
+    `whole` is the mismatch of a single run, before it is split into shared and own parts.
+    """
     likelihoods = [_crossing_likelihood(truth, whole) for truth in truths]
     if not whole.level_m3.any():
         return PlannedPathGroup(tuple(_of_bridge(one, None) for one in likelihoods), None)
@@ -102,7 +105,7 @@ def planned_path_group(
 
 
 def _crossing_likelihood(truth: PosteriorAtTruth, whole: Mismatch) -> CrossingLikelihood:
-    """Return the likelihood of one crossing, the only part of `fusion` that this package needs."""
+    """Return the likelihood of one crossing at its true parameters."""
     problem, y = truth
     mismatch = whole._replace(speed_m_per_s=problem.mismatch.speed_m_per_s)
     problem = problem._replace(mismatch=mismatch)
@@ -111,7 +114,10 @@ def _crossing_likelihood(truth: PosteriorAtTruth, whole: Mismatch) -> CrossingLi
 
 
 def _of_bridge(crossing: CrossingLikelihood, own: FloatArray | None) -> FloatArray:
-    """Return the precision (b + k, b + k), truck and own waves of the crossing integrated out."""
+    """Return the precision (b + k, b + k) without the crossing's truck and own mismatch.
+
+    Both are integrated out; the covariance of the own mismatch at the knots is own own'.
+    """
     precision = crossing.root.T @ crossing.root
     b, t = len(crossing.bridge.names), len(crossing.truck.names)
     truck = b + np.arange(t)
@@ -127,9 +133,10 @@ def _of_bridge(crossing: CrossingLikelihood, own: FloatArray | None) -> FloatArr
 def survey_information(
     tracks: Sequence[PlannedPathGroup], crossings: float, bridge: int
 ) -> FloatArray:
-    """Return the precision (b, b) of the bridge after `crossings`, divided evenly among groups.
+    """Return the precision (b, b) of the bridge after a number of `crossings`.
 
-    `bridge` is the number b of its parameters.
+    They are divided evenly among the planned crossings of all groups. `bridge` is the number b of
+    its parameters.
     """
     total = np.zeros((bridge, bridge))
     each = crossings / sum(len(track.precisions) for track in tracks)
@@ -156,11 +163,11 @@ def survey_spreads(
     lengths_m: FloatArray,
     truth: FloatArray | None = None,
 ) -> SurveySpreads:
-    """Return the posterior spreads of a survey of this precision (b, b).
+    """Return the posterior spreads of a survey with this precision (b, b).
 
     `lengths_m` is (e,). `truth` (b,) is the bridge with c in place of ln EI, by default the nominal
-    one. Gibbs draws of the normal in 1/EI times the priors are used, because the posterior is far
-    from normal in ln EI for poorly determined elements.
+    bridge. The spreads are those of Gibbs draws of the normal in 1/EI times the priors, because the
+    posterior of poorly determined elements is far from normal in ln EI.
     """
     b, e = precision.shape[0], known.sigma.size
     elements = np.arange(b - e, b)
@@ -191,7 +198,7 @@ def non_increasing(spreads: FloatArray) -> FloatArray:
     More crossings never widen a posterior: an increase between two rows is an error of a standard
     deviation from a finite number of draws.
     """
-    from scipy.optimize import isotonic_regression  # slow to import, of plans alone
+    from scipy.optimize import isotonic_regression  # slow to import; only plans need it
 
     columns = [isotonic_regression(column, increasing=False).x for column in spreads.T]
     return np.stack(columns, axis=1)
