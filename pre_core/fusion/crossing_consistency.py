@@ -31,8 +31,8 @@ from pre_core.fusion.variability import variability_posterior
 
 _USUAL_CHANGE = 0.03
 _SUSPICIOUS, _INCOMPATIBLE = 1e-3, 1e-4
-"""Probability of such an outlier among all crossings below which it is tested with the variability
-of the others, and below which it is then excluded."""
+"""Probability that the worst of all crossings is as far away, below which a crossing is tested with
+the variability of the others, and below which it is then excluded."""
 _FEWEST = 3
 """Fewest crossings of which one can be excluded: of two that contradict each other either may be
 wrong; of more, a third may be."""
@@ -120,8 +120,9 @@ def _crossing_change(
 ) -> tuple[FloatArray, FloatArray]:
     """Return precision (e, e) and linear part (e,) of a crossing's own change of the compliances.
 
-    They follow from the sum of all, this one included. Trucks, wheel-path groups and the other
-    bridge parameters are as all others determine them, so that poorly determined ones do not count.
+    They follow from the sum of all crossings, this one included. Trucks, wheel-path groups and the
+    other bridge parameters have the values that all other crossings determine, so that poorly
+    determined ones do not count.
     """
     across = np.zeros((linear.size, elements.size))
     across[one.places] = one.precision[:, elements]

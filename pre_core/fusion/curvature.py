@@ -4,7 +4,8 @@ With different wheel paths a single crossing determines elements only roughly, a
 near the priors. A normal about that point lacks the curvature from there to the truth, which is the
 same in all crossings of a survey and does not average out. A crossing's likelihood therefore keeps
 a surface of second order (`response_surface`), compressed to the few significant sums of products,
-and fusion linearises each crossing again about the common estimate.
+and fusion linearises each crossing again about the common estimate. The offset is the crossing's
+longitudinal offset, which these terms contain, too.
 """
 
 from typing import NamedTuple
@@ -18,18 +19,20 @@ _FARTHEST = 2.0
 """Largest size of a move at which the terms apply, relative to the standard deviation of the points
 to which the surface was fitted."""
 _FARTHEST_OF_DIFFERENCES = 0.7
-"""The same for terms in compliances: differences with that step, from the optimum of the crossing.
-Extrapolated to three sizes they overestimated the likelihood of a bridge with a restrained end by
-a factor of e, in each of twelve runs of an independent simulator."""
+"""The same for terms in compliances, which are differences of this step about the crossing's
+optimum. Extrapolated to a size of three, they overestimate the likelihood of a bridge with a
+restrained end by a factor of e, in each of twelve runs of an independent simulator."""
 _PLACE_STEPS = 4
+"""Number of Newton steps to the likeliest offset."""
 
 
 class CurvatureTerms(NamedTuple):
     """Joint second-order effects of moves of the bridge's parameters and of the offset."""
 
-    about: FloatArray  # (b,) the bridge's coordinates from which the moves count
+    about: FloatArray  # (b,) the bridge's coordinates from which the moves start
     directions: FloatArray
-    """Moves of unit size as columns (b + 1, b + 1), of the bridge and in m of the offset."""
+    """Columns (b + 1, b + 1): moves of size one, of the bridge's b coordinates and of the offset in
+    m."""
     shapes: FloatArray
     """Coefficients (k, pairs) of each term in the products u_i u_j, i <= j by rows, of the sizes u
     of the moves."""
@@ -51,8 +54,9 @@ def linearise_with_curvature(
 ) -> tuple[FloatArray, FloatArray]:
     """Return root (m, p), target (m,) of the normal about a bridge `at` (b,), without the offset.
 
-    The inputs are those of x = (bridge, p - b others, offset, terms), |root x - target|²/2.
-    `priors` is the precision (p - b, p - b) of the others, which determines the offset for `at`.
+    With the inputs, the negative log-likelihood is |root x - target|²/2 of x = (bridge, p - b
+    others, offset, terms). The likeliest offset for `at` also depends on `priors`, the precision (p
+    - b, p - b) of the others.
     """
     b = bends.about.size
     k = bends.shapes.shape[0]
@@ -71,7 +75,7 @@ def linearise_with_curvature(
         bend, slope = _bent(bends, inverse, move, place)
         left = target - of_bridge @ at - of_place * place - of_bends @ bend
         along = of_place + of_bends @ slope[:, b]
-        # Its part that the others do not explain.
+        # The part of the offset's effect that the others do not explain.
         free = along - of_others @ cho_solve(others, of_others.T @ along)
         step = float(free @ left) / float(free @ along)
         place += float(np.clip(step, -size, size))
@@ -82,16 +86,16 @@ def linearise_with_curvature(
     left = target - of_bridge @ at - of_place * place - of_bends @ bend
     logs = slice(b - bends.logarithms, b)
     at[logs] = np.exp(at[logs])
-    rows_at[:, logs] /= at[logs]  # slopes by c
+    rows_at[:, logs] /= at[logs]  # derivatives with respect to c, not ln c
     left = left + rows_at[:, :b] @ at + along * place
     along = along / np.linalg.norm(along)
     return rows_at - np.outer(along, along @ rows_at), left - along * (along @ left)
 
 
 class CurvedForm(NamedTuple):
-    """Residuals (m,) at any bridge as `rows` times features, with the likeliest offset there.
+    """Residuals (m,) at any bridge as `rows` times features (f,), at the likeliest offset.
 
-    The features (f,) are one, the bridge's coordinates (b,), and with terms the offset and the
+    The features are 1, the bridge's coordinates (b,) and, if there are terms, the offset and the
     terms (k,).
     """
 
@@ -102,7 +106,8 @@ class CurvedForm(NamedTuple):
     products: FloatArray
     """Symmetric form (k, (b + 1)²) of each term."""
     free: FloatArray
-    """Weight (f, f) of features where all else but the bridge is free."""
+    """Quadratic form (f, f) of features that the likeliest offset minimises: everything but bridge
+    and offset is eliminated."""
 
     def features(self, at: FloatArray) -> FloatArray:
         """Return the features (n, f) of bridges `at` (n, b)."""
@@ -113,7 +118,7 @@ class CurvedForm(NamedTuple):
         return constant + place * slope + place**2 * square
 
     def along(self, at: FloatArray) -> FloatArray:
-        """Return the projection (m, m) of residuals that leaves out the offset at a bridge (b,)."""
+        """Return the projection (m, m) that removes the offset's effect at a bridge (b,)."""
         unit = np.zeros(self.rows.shape[0])
         if self.bends is not None:
             constant, slope, square = self._by_offset(at[None, :])
@@ -123,12 +128,13 @@ class CurvedForm(NamedTuple):
         return np.asarray(np.eye(unit.size) - np.outer(unit, unit))
 
     def _by_offset(self, at: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return constant, slope (n, f) and square (f,) of the features as moves of the offset.
+        """Return the features of bridges `at` (n, b) as a quadratic in a move of the offset.
 
-        These are in addition to the offset of bridges `at` (n, b) within the terms' reach.
+        These are the constant (n, f), slope (n, f) and square (f,). The move starts at the
+        likeliest offset of the bridges' moves within the terms' reach.
         """
         bends = self.bends
-        assert bends is not None  # noqa: S101 - the caller has looked
+        assert bends is not None  # noqa: S101 - the caller has checked
         b, k = bends.about.size, bends.shapes.shape[0]
         about = to_surface_coordinates(bends, bends.about)
         wanted = to_surface_coordinates(bends, at) - about
@@ -155,8 +161,8 @@ class CurvedForm(NamedTuple):
     def _likeliest_offset(
         self, constant: FloatArray, slope: FloatArray, square: FloatArray
     ) -> FloatArray:
-        """Return the move (n,) of the offset with the least squares."""
-        assert self.bends is not None  # noqa: S101 - the caller has looked
+        """Return the move (n,) of the offset that minimises the squares; shapes as `_by_offset`."""
+        assert self.bends is not None  # noqa: S101 - the caller has checked
         b = self.bends.about.size
         size = float(np.linalg.norm(self.bends.directions[b]))
         largest = farthest_of(self.bends) * size
@@ -214,7 +220,7 @@ def _within_reach(
 ) -> tuple[FloatArray, FloatArray]:
     """Return moves (n, b) as far as the terms apply, and the likeliest offsets (n,) there.
 
-    `inverse` is that of the directions, `farthest` the largest size of a move.
+    `inverse` is the inverse of the directions, `farthest` the largest size of a move.
     """
     b = bends.about.size
     sizes, place = move @ inverse[:, :b].T, inverse[:, b]
@@ -226,7 +232,7 @@ def _within_reach(
 def _bent(
     bends: CurvatureTerms, inverse: FloatArray, move: FloatArray, place: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the terms (k,) and their derivative (k, b + 1) by the `move` (b,) and the offset."""
+    """Return the terms (k,) and their derivatives (k, b + 1) at a `move` (b,) and an offset."""
     sizes = inverse @ np.append(move, place)
     number = sizes.size
     first, second = np.triu_indices(number)

@@ -1,11 +1,11 @@
 """Posterior of a bridge on the response surfaces of its crossings, without a common linearisation.
 
-Where crossings determine elements poorly, the widths of a normal about the most likely bridge are
-those of that bridge: it has no rotational restraint, and its ends are known better than those of
-the true one. A bridge with restraint may be as likely and far away. So the bridge is drawn
-(`search.tempering`) by the likelihoods of all crossings at the drawn bridge itself. What is nearly
-linear there is integrated out: trucks, waves of the mismatch, changes of the bridge, and each
-crossing's offset.
+Where crossings determine elements poorly, a normal about the most likely bridge has the widths of
+that bridge. If it has no rotational restraint, its ends are determined better than those of a true
+bridge that has one, and that may be as likely and far away. So bridges are drawn
+(`search.tempering`) with the likelihoods of all crossings at each drawn bridge itself. Variables
+that are nearly linear there are integrated out: trucks, waves of the mismatch, changes of the
+bridge, and each crossing's offset.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -45,18 +45,21 @@ _FIRST_MOVES, _MOVES = (6,), (45, 45)
 
 
 class _CurvedCrossing(NamedTuple):
-    """A crossing's squares, with its own normal variables integrated out, as forms of features."""
+    """A crossing's log-likelihood as quadratic forms of its features and s shared variables.
+
+    The crossing's own normal variables are integrated out.
+    """
 
     form: CurvedForm
-    squares: FloatArray  # (f, f)
-    pull: FloatArray  # (f, s) on shared variables
-    precision: FloatArray  # (s, s) of these
+    squares: FloatArray  # (f, f) form of the features
+    pull: FloatArray  # (f, s): features to the linear part of shared variables
+    precision: FloatArray  # (s, s) of shared variables
     places: NDArray[np.int64]
-    """Indices (s,) of these among all shared ones."""
+    """Indices (s,) of these variables among all shared ones."""
 
 
 class CurvedSum(NamedTuple):
-    """All crossings of a bridge, with all that is nearly linear integrated out."""
+    """Sum of the log-likelihoods of all crossings, as a function of the bridge alone."""
 
     crossings: tuple[_CurvedCrossing, ...]
     factor: tuple[FloatArray, bool]
@@ -82,7 +85,7 @@ class CurvedSum(NamedTuple):
 
 
 def _squares_and_pull(x: FloatArray, of: _CurvedCrossing) -> tuple[FloatArray, FloatArray]:
-    """Return a crossing's squares (k,) and pull (k, s) on shared variables at bridges x (k, b)."""
+    """Return a crossing's squares (k,) and linear parts (k, s) of shared variables, x (k, b)."""
     features = of.form.features(x)
     return np.sum((features @ of.squares) * features, axis=1), features @ of.pull
 
@@ -94,7 +97,7 @@ def curved_sum(
     priors: BridgePriors,
     variability: tuple[float, float],
 ) -> CurvedSum:
-    """Return the crossings in `information`, of a bridge that varies by (tau, rho)."""
+    """Return the sum of `parts`, the crossings in `information`; `variability` is (tau, rho)."""
     layout = information.layout
     crossings = tuple(
         _curved_crossing(part, tracks, information, priors, variability) for part in parts
@@ -176,7 +179,8 @@ def curved_draws(
             found = of.log_posterior(latent.values(v), pool) + latent.log_share(v)
             return np.where(np.isfinite(found), found, -np.inf)
 
-        # Far from the most likely bridge nothing follows restraints and bearings as it does there.
+        # The correlations with restraints and bearings at the most likely bridge do not hold far
+        # from it, so that the first coordinates are independent.
         alone = latent_coordinates(cut_off, priors.log_odds, of.mean, np.diag(np.diag(near)))
         target = partial(log_posterior, alone)
         first = tempering.tempered_draws(
@@ -205,7 +209,7 @@ def curved_draws(
 
 
 def _covariance(y: FloatArray, near: FloatArray) -> FloatArray:
-    """Return the covariance (b, b) of draws y (k, b), with that of `near` where hardly any vary."""
+    """Return the covariance (b, b) of draws y (k, b); `near` (b, b) gives too small variances."""
     covariance = np.cov(y.T)
     for place in np.flatnonzero(np.diag(covariance) < _LEAST_VARIANCE * np.diag(near)):
         covariance[place] = covariance[:, place] = 0.0

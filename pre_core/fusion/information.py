@@ -1,4 +1,4 @@
-"""Information of crossings, and its sum with the priors, each once."""
+"""Information of crossings, and its sum with the priors, each of which is counted once."""
 
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
@@ -13,10 +13,11 @@ from pre_core.fusion.path_groups import PathGroupKey, SharedMismatch
 _ROUGH_SPREAD = 0.6
 """Standard deviation of a normal prior of c that replaces the log-normal one in evidence ratios."""
 _ROUNDED = 1e-10
+"""Eigenvalue of a covariance, relative to the largest, below which it counts as zero."""
 
 
 class BridgePriors(NamedTuple):
-    """Priors in the order of the likelihoods' bridge coordinates, which have `elements` last."""
+    """Priors in the order of the likelihoods' bridge coordinates; the last `elements` are EI."""
 
     coordinates: Coordinates
     mass_powers: FloatArray  # (b,)
@@ -38,14 +39,14 @@ class JointLayout(NamedTuple):
 class CrossingInformation(NamedTuple):
     """A crossing's likelihood with its own part of the long waves integrated out."""
 
-    precision: FloatArray
-    linear: FloatArray
+    precision: FloatArray  # (s, s)
+    linear: FloatArray  # (s,): precision times the estimate
     places: NDArray[np.int64]
-    """Indices of its coordinates among all."""
+    """Indices (s,) of its coordinates among all."""
 
 
 class JointInformation(NamedTuple):
-    """Crossings in common coordinates, ready to be added."""
+    """Information of several crossings in n common coordinates."""
 
     names: tuple[str, ...]
     layout: JointLayout
@@ -67,14 +68,14 @@ class JointInformation(NamedTuple):
 def posterior_information(
     information: JointInformation, priors: BridgePriors, crossings: Sequence[CrossingInformation]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return precision (n, n) and linear part (n,) of all coordinates with priors of the bridge."""
+    """Return precision (n, n) and linear part (n,) of `crossings` with all priors."""
     return add_bridge_priors(information, priors, *sum_information(information, crossings))
 
 
 def add_bridge_priors(
     information: JointInformation, priors: BridgePriors, precision: FloatArray, linear: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a sum (n, n), (n,) of crossings with normal priors of the bridge's parameters."""
+    """Return precision (n, n) and linear part (n,) plus normal priors of the bridge."""
     layout = information.layout
     precision, linear = precision.copy(), linear.copy()
     single = np.arange(layout.bridge - priors.elements)
@@ -88,7 +89,7 @@ def add_bridge_priors(
 def sum_information(
     information: JointInformation, crossings: Sequence[CrossingInformation]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return precision (n, n) and linear part (n,) of all coordinates without bridge priors."""
+    """Return precision (n, n) and linear part (n,) of `crossings` without priors of the bridge."""
     precision, linear = information.prior.copy(), np.zeros(information.layout.size)
     for one in crossings:
         precision[np.ix_(one.places, one.places)] += one.precision
@@ -102,10 +103,11 @@ def leave_one_out_change(
     linear: FloatArray,
     whole: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """Return precision (e, e) and linear part (e,) of the deviation of one crossing from all.
+    """Return precision (e, e) and linear part (e,) of one crossing's change from all others.
 
-    `precision` and `linear` are the crossing's own, and `across` (n, e) couples all n coordinates;
-    `whole` are precision and linear part of the sum of all, this one included.
+    `precision` (e, e), `linear` (e,) and `across` (n, e) are the crossing's own, the last between
+    its change and all n coordinates; `whole` are precision (n, n) and linear part (n,) of the sum
+    of all crossings, this one included.
     """
     explained = np.linalg.solve(whole[0], np.column_stack([across, whole[1]]))
     conditional = precision - across.T @ explained[:, :-1]
@@ -113,5 +115,5 @@ def leave_one_out_change(
 
 
 def squared_distance(linear: FloatArray, spread: FloatArray) -> float:
-    """Return the squared distance from zero of a linear part (e,) with covariance (e, e)."""
+    """Return the squared Mahalanobis distance from zero of a linear part with covariance (e, e)."""
     return float(linear @ np.linalg.pinv(spread, _ROUNDED, hermitian=True) @ linear)

@@ -6,8 +6,6 @@ average out. Each crossing has its own part of those waves, too, and its own cha
 element's compliance: between crossings EI varies with temperature and with effects that the model
 lacks, by a relative standard deviation tau of which a share rho is common to all elements. Normal
 variables are integrated out; tau and rho are evaluated on a grid.
-
-This module is long: all of it uses one layout of all coordinates.
 """
 
 from collections.abc import Collection, Sequence
@@ -82,8 +80,8 @@ def sample_joint(
 ) -> FusedDraws:
     """Return draws of a bridge, `count` of each chain; they do not depend on `threads`.
 
-    `parts` are the crossings in `information`. With response surfaces the bridge varies by the root
-    mean square of tau.
+    `parts` are the crossings in `information`. If they have response surfaces, tau is fixed at its
+    root mean square for the draws of the bridge.
     """
     between = variability_posterior(information, priors)
     if any(one.likelihood.bends and one.likelihood.bends.logarithms for one in parts):
@@ -119,7 +117,7 @@ def build_joint(
             for part in parts
         )
         information = JointInformation(names, layout, crossings, prior, centre, shared)
-        # Without a change, crossings more precise than the bridge is constant would bias it.
+        # Without variability, crossings with intervals narrower than it would bias the centre.
         of = varying_bridge(information._replace(crossings=information.select(consistent)))
         before, centre = (
             centre,
@@ -184,7 +182,7 @@ def _prior(layout: JointLayout, tracks: dict[PathGroupKey, PathGroup]) -> FloatA
         prior[places, places] = 1.0
     for key, places in layout.tracks.items():
         common = tracks[key].common
-        assert common is not None  # noqa: S101 - it has a place among the unknowns
+        assert common is not None  # noqa: S101 - a group with coordinates has one
         prior[np.ix_(places, places)] = np.linalg.inv(common)
     return prior
 
@@ -247,9 +245,11 @@ def _crossing_information(
 def add_mass_parameter(
     crossing: CrossingLikelihood, spread: float, priors: BridgePriors, centre: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return precision and linear part of bridge, truck, unit normal of the mass, and waves.
+    """Return precision (n, n) and linear part (n,) with the mass error as a further coordinate.
 
-    The mass scales truck and bridge together; `centre` (b,) is the bridge that is scaled.
+    The n coordinates are those of bridge and truck, the mass error in units of its `spread`, and
+    the waves. The mass scales truck and bridge together; `centre` (b,) is the bridge that is
+    scaled.
     """
     b, t = len(crossing.bridge.names), len(crossing.truck.names)
     heavier = crossing.root[:, :b] @ (spread * mass_sensitivity(priors, centre))[:, None]
@@ -266,7 +266,7 @@ def _draw_curved(
     report: Report,
     threads: int,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return draws as `_draw_bridge`, of the crossings' surfaces."""
+    """Return draws as `_draw_bridge` does, on the crossings' response surfaces."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 22,)))
     progress = partial(report, "drawing the bridge")
     drawn = curved_draws(of, priors, count * CHAINS, rng, progress, threads)

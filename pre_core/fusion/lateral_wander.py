@@ -19,19 +19,22 @@ from pre_core.physics.road import Profile
 from pre_core.physics.surface import Footprint
 
 _APART_STEPS = 4
-"""Step of the second difference that determines the shared fraction: waves of one to four metres.
-"""
+"""Step, in values off the bridge, of the second difference that determines the shared fraction: it
+passes waves of one to four metres."""
 _MAX_SHIFT_M, _ROAD_STEP_M = 1.5, 0.05
 _PLACED_M = 0.5
-"""Standard deviation of a run's longitudinal offset."""
+"""Prior standard deviation of a run's longitudinal offset."""
 _ALIGNMENTS, _FEWEST_RUNS = 3, 2
+"""Number of rounds that align each run to the others, and fewest runs with a shared fraction."""
 _USUAL_WANDER_M, _USUAL_SPREAD = 0.12, 0.7
 """Median of the wander's log-normal prior, and standard deviation of its logarithm: one driver who
 is asked to keep to one path."""
 _LEVEL_SPREAD = 0.15
 """Relative standard deviation of the estimated level of the mismatch."""
 WANDERS_M = np.geomspace(0.01, 1.0, 25)
+"""Grid of the wander."""
 _FINE = 481
+"""Number of points of the finer grid on which the posterior is evaluated."""
 
 
 class SharedFraction(NamedTuple):
@@ -51,7 +54,7 @@ class WanderPosterior(NamedTuple):
 def align_runs_m(
     runs: Sequence[OffBridgeMismatch | None], roads: Sequence[Profile | None]
 ) -> FloatArray:
-    """Return the shift (k,) in m of each run's road along the chainage, relative to the others.
+    """Return the shift (k,) in m of each run's road profile along the chainage.
 
     Unless every run has a road profile, the mismatches are compared instead.
     """
@@ -119,7 +122,10 @@ def _mean_known(bent: FloatArray) -> FloatArray:
 
 
 def _gain(one: FloatArray, other: FloatArray, step_m: float) -> float:
-    """Return the log-likelihood gain of a common part of two series, one free value a metre."""
+    """Return the log-likelihood gain by a common part of two series (n,).
+
+    Both have one independent value per metre.
+    """
     both = np.isfinite(one) & np.isfinite(other)
     size = float(np.sqrt((one[both] @ one[both]) * (other[both] @ other[both])))
     correlation = float(one[both] @ other[both]) / size if size > 0.0 else 0.0
@@ -181,12 +187,15 @@ def _shifted(values: FloatArray, steps: float) -> FloatArray:
 
 
 def _seen(cycles_per_m: FloatArray) -> FloatArray:
-    """Return the power gain (g,) of the second difference."""
+    """Return the power gain (g,) of the second difference at spatial frequencies (g,)."""
     return np.asarray(16.0 * np.sin(np.pi * cycles_per_m * _APART_STEPS * OFF_BRIDGE_STEP_M) ** 4)
 
 
 def _claimed_power(mismatch: Mismatch) -> tuple[float, float]:
-    """Return the variance in m² of second differences of the mismatch, and their bandwidth."""
+    """Return the variance in m² of second differences that the levels imply, and their bandwidth.
+
+    The bandwidth is in cycles/m.
+    """
     grid = mismatch.shapes.cycles_per_m
     seen = (mismatch.level_m3 @ mismatch.shapes.density) * _seen(grid)
     step = float(grid[1] - grid[0])
@@ -195,7 +204,7 @@ def _claimed_power(mismatch: Mismatch) -> tuple[float, float]:
 
 
 def wander_posterior(mismatch: Mismatch, share: SharedFraction | None) -> WanderPosterior:
-    """Return the posterior of the wander, given the runs' shared fraction of the short waves.
+    """Return the posterior of the wander, given the shared fraction of the runs' mismatch.
 
     Without a shared fraction it is the prior.
     """

@@ -8,11 +8,11 @@ It contains no prior, because each prior must count once in a fusion. It is norm
   cubic splines along the road. Part of them is the same in all runs of a wheel-path group, which
   a single crossing cannot separate.
 
-With different profiles it includes the longitudinal offset and its curvature terms with the bridge
-(`fusion.curvature`).
+If the axles follow different profiles, it includes the longitudinal offset and its curvature terms
+with the bridge (`fusion.curvature`).
 
-Everything else of this crossing - trajectory, delays, gains, initial vibration, short waves of the
-mismatch - is integrated out. The remainder is small and is stored with the crossing's result.
+All other variables of the crossing (trajectory, delays, gains, initial vibration, short waves of
+the mismatch) are integrated out. The likelihood is small and is stored with the crossing's result.
 """
 
 from typing import NamedTuple
@@ -53,18 +53,19 @@ from pre_core.fusion.short_waves import ShortWaveResponse, short_wave_response
 from pre_core.search import levenberg_marquardt
 
 _ROUNDED = 1e-12
+"""Eigenvalue of the precision, relative to the largest, below which it counts as zero."""
 _SEED = 1
 
 
 class Coordinates(NamedTuple):
-    """Meaning of the first entries of x: (k,) each. EI: c = location/EI; else see `is_log`."""
+    """Names, nominal values and scales (k,) of entries of x, which for elements are location/EI."""
 
     names: tuple[str, ...]
     location: FloatArray
     """Nominal values."""
     scale: FloatArray
     is_log: NDArray[np.bool_]
-    """Whether x = ln(value/location)/scale; otherwise value/scale."""
+    """Flags (k,): x = ln(value/location)/scale; otherwise x = value/scale. Not for elements."""
 
 
 class CrossingLikelihood(NamedTuple):
@@ -148,7 +149,7 @@ def likelihood(
 def _in_fusion(
     found: Optimum,
 ) -> tuple[posterior.PosteriorProblem, levenberg_marquardt.LMState]:
-    """Return problem and state at an optimum with the noise of a run among others.
+    """Return problem and state at an optimum, with the noise that a run in a fusion has.
 
     Long waves of the mismatch are parameters, and the noise from a tandem's front axle is shared.
     """
@@ -165,7 +166,10 @@ def _in_fusion(
 def _with_mismatch_bias(
     found: Optimum, precision: FloatArray, linear: FloatArray, truck: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return precision (n, n) and linear part (n,) with the bias's error of the `truck` (t,)."""
+    """Return precision (n, n) and linear part (n,) with the uncertainty of the mismatch bias.
+
+    `truck` (t,) are the truck's indices in y; the bias of other parameters is neglected.
+    """
     b = posterior.layout(found.problem).bridge.size
     led = np.zeros(linear.size)
     led[b : b + truck.size] = mismatch_bias(found)[truck]

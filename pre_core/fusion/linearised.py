@@ -1,4 +1,4 @@
-"""A crossing's residuals as a function of what fusion shares, linear or of second order."""
+"""A crossing's residuals as a function of shared variables, linear or of second order."""
 
 from typing import NamedTuple
 
@@ -13,12 +13,16 @@ from pre_core.fusion.curvature import CurvatureTerms
 from pre_core.search import levenberg_marquardt
 
 _LEAST_TERM = 0.05
-"""Smallest curvature term that is kept, if all moves are of unit size, in standard deviations."""
+"""Smallest curvature term that is kept: change of the residuals, in their standard deviation, by
+moves of unit size."""
 _MAX_TERMS = 60
 
 
 class Linearised(NamedTuple):
-    """Residuals (m,) + jacobian (m, n) (x - centre), of bridge, truck, waves, then all others."""
+    """Residuals residual (m,) + jacobian (m, n) (x - centre) as a function of x (n,).
+
+    The entries of x are those of bridge, truck and waves, then all others.
+    """
 
     jacobian: FloatArray
     residual: FloatArray
@@ -37,11 +41,11 @@ def of_surface(surface: ResponseSurface, sigma: FloatArray) -> tuple[CurvatureTe
     per_y = np.ones(surface.centre.size)
     per_y[-1 - n : -1] = -sigma
     centre = per_y * surface.centre
-    centre[-1] = 0.0  # the offset counts from there
+    centre[-1] = 0.0  # the offset is relative to the surface's centre
     size = per_y * surface.size
     about = centre[:-1].copy()
     about[-n:] = np.exp(about[-n:])
-    # Slopes by a bridge that the truck does not follow.
+    # Derivatives with respect to the bridge for a fixed truck.
     slopes = (surface.slopes - surface.linear @ surface.follow) / size
     jacobian = np.hstack(
         [slopes[:, :-1], surface.linear, surface.waves, slopes[:, -1:], surface.products @ shapes]
@@ -59,9 +63,10 @@ def of_optimum(
     kept: NDArray[np.int64],
     waves: FloatArray,
 ) -> Linearised:
-    """Return the normal about an optimum, of its residuals `rows` (m,) and mismatch `waves` (m, q).
+    """Return the linearisation at an optimum, of its residuals `rows` (m,).
 
-    The coordinates that are not `kept` (n,) come last.
+    The entries of x are the coordinates `kept` (n,), the mismatch with the effects `waves` (m, q),
+    and all other coordinates.
     """
     centre, jacobian = to_compliance_coordinates(problem, state.y, state.jacobian[rows])
     others = np.setdiff1d(np.arange(centre.size), kept)

@@ -28,19 +28,19 @@ from pre_core.fusion.short_waves import BESIDE_M
 from pre_core.physics.simulate import rear_position_m
 
 KNOT_M, ALIKE_KNOT_M = 1.25, 0.5
-"""Knot spacing of the long mismatch waves, cubic between; for different and for equal footprints.
-"""
+"""Spacing of the cubic splines' knots, for different and for equal footprints."""
 _LONG_OF_KNOT = 0.25
 """Boundary of the long waves: about four knots. With different tyres 80 to 97 % of the information
 about a bridge lies below half of these frequencies. Equal tyres that run on laterally shifted
 paths leave short waves as large as long ones, so that waves of two metres are informative too."""
 _LONG_SHARE = 0.97
-"""Share of the power of the longest waves; the rest stays noise of the crossing, because the
-covariance of the residuals must be positive definite."""
+"""Share of the power of the longest waves that is described by coefficients; the rest stays noise
+of the crossing, because the covariance of the residuals must be positive definite."""
 _CUBIC = 3
 OFF_BRIDGE_STEP_M = 0.25
 """Spacing of the mismatch values off the bridge."""
 _FARTHEST_OFF_M = 60.0
+"""Greatest distance from the bridge of the mismatch values off the bridge."""
 
 
 class OffBridgeMismatch(NamedTuple):
@@ -134,7 +134,10 @@ def add_adjacent_prior(
 
 
 def white_knots(problem: posterior.PosteriorProblem, y: FloatArray, grid: FloatArray) -> FloatArray:
-    """Return the effect of 1 mm of each coefficient on the whitened residuals: (3 m, q)."""
+    """Return the effect of 1 mm of each coefficient on the whitened residuals (3 m, q).
+
+    The truck is at y (f,); `grid` (q,) are the knots.
+    """
     crossing, rows = problem.crossing, problem.rows
     at = posterior.points(problem, y[None, :])
     rear = rear_m(crossing, at)

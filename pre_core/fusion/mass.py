@@ -7,7 +7,7 @@ from pre_core.fusion.information import BridgePriors
 
 
 def mass_sensitivity(priors: BridgePriors, centre: FloatArray) -> FloatArray:
-    """Return the derivative (b,) of the bridge's coordinates at `centre` (b,) by ln of the mass."""
+    """Return d x/d ln mass (b,) of the bridge's coordinates x at `centre` (b,)."""
     of, power = priors.coordinates, priors.mass_powers
     change = np.where(of.is_log, power / of.scale, power * centre)
     elements = np.arange(centre.size - priors.elements, centre.size)

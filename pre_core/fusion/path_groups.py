@@ -30,7 +30,7 @@ from pre_core.physics.road import Profile
 from pre_core.physics.surface import Footprint
 
 _NOTHING = 1e-9
-"""Relative variance below which a sum of waves is rounding."""
+"""Variance of a direction, relative to the largest, below which it is rounding."""
 
 
 class FusionInput(NamedTuple):
@@ -40,6 +40,7 @@ class FusionInput(NamedTuple):
     likelihood: CrossingLikelihood
     truck: str
     direction: int
+    """1 from the bridge's start to its end, -1 in the other direction."""
     footprints: tuple[Footprint, Footprint]
     mass_spread: float
     """Relative standard deviation of the truck's total mass, one error in all its crossings."""
@@ -74,6 +75,7 @@ class PathGroup(NamedTuple):
 
     shared: SharedMismatch
     own_root: FloatArray
+    """Root (q, r) of the covariance of a run's own part in mm²."""
     whole: FloatArray
     """Precision (q, q) of the long-wave coefficients, own and shared parts together."""
     common: FloatArray | None
@@ -127,7 +129,10 @@ def _track(key: PathGroupKey, runs: list[FusionInput]) -> PathGroup:
 def _short_roots(
     runs: list[FusionInput], cycles_per_m: FloatArray, density: FloatArray
 ) -> dict[str, FloatArray]:
-    """Return roots of the covariance by short waves of a spectrum (g,), of runs with a response."""
+    """Return `PathGroup.short_roots` for short waves of a density (g,) in m³.
+
+    Runs without a response are omitted.
+    """
     have = {run.name: run.likelihood.short_waves for run in runs}
     responses = {name: one for name, one in have.items() if one is not None}
     if len(responses) < 2:
@@ -152,7 +157,7 @@ def wave_precision(part: FusionInput, groups: Mapping[PathGroupKey, PathGroup]) 
 
 
 def low_rank_root(covariance: FloatArray) -> FloatArray:
-    """Return a root (q, r) of a covariance (q, q) = root root', without directions of rounding."""
+    """Return a root (q, r) of a covariance (q, q) = root root'; its rounding errors are dropped."""
     values, vectors = np.linalg.eigh(covariance)
     kept = values > _NOTHING * values[-1]
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))

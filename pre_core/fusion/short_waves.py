@@ -2,12 +2,12 @@
 
 The likelihood of a crossing treats the mismatch in waves shorter than those of its coefficients as
 noise of its own. Runs on one path share these waves too, as far as the lateral wander leaves them
-alike. Most of them reach an estimate by the frequency f of a mode of the bridge, as waves of f/v
-cycles/m: runs at other speeds v are affected by other waves.
+alike. A wave affects an estimate mostly through the frequency f of a mode of the bridge, which it
+excites at f/v cycles/m: runs at other speeds v are affected by other waves.
 
-So each crossing keeps the response of its estimate to waves of the mismatch. Fusion adds to a
-crossing's covariance that of its errors with those of the other runs, so that the sum of all is as
-uncertain as the shared errors make it.
+So each crossing keeps the response of its estimate to waves of the mismatch. Fusion adds the
+covariance of a crossing's errors with those of the other runs to the crossing's own covariance. The
+sum of all crossings then has the uncertainty that the shared errors cause.
 """
 
 from collections.abc import Sequence
@@ -33,13 +33,13 @@ class ShortWaveResponse(NamedTuple):
     """Change of an estimated bridge, b coordinates, by n waves of the mismatch of 1 m each."""
 
     step_cycles_per_m: float
-    """Distance between the waves, which begin one step above zero."""
+    """Spacing of the spatial frequencies, which begin one step above zero."""
     cosine: FloatArray  # (b, n)
     sine: FloatArray  # (b, n)
 
     @property
     def cycles_per_m(self) -> FloatArray:
-        """The waves (n,)."""
+        """The spatial frequencies (n,) of the waves."""
         return self.step_cycles_per_m * np.arange(1, 1 + self.cosine.shape[1])
 
 
@@ -70,8 +70,8 @@ def shared_error_roots(
 ) -> list[FloatArray]:
     """Return for each run a root (b, r) of its errors' covariance with those of all other runs.
 
-    `density_m3` (n,) is the one-sided spectrum of the shared part, at the waves of the
-    responses. Of the covariance of two runs each takes half.
+    `density_m3` (n,) is the one-sided spectrum of the shared part, at the waves of the responses.
+    Each of two runs takes half of their covariance.
     """
     phasors = np.stack([one.cosine + 1j * one.sine for one in responses])
     weighted = phasors * (density_m3 * responses[0].step_cycles_per_m)

@@ -48,7 +48,7 @@ class VariabilityPosterior(NamedTuple):
 
 
 class _SameLayout(NamedTuple):
-    """Crossings (k) with the same coordinates among all."""
+    """The k crossings that have the same coordinates `places` (p,) among all."""
 
     places: NDArray[np.int64]
     across: FloatArray  # (k, e, p) rows of their precisions at the elements
@@ -56,10 +56,10 @@ class _SameLayout(NamedTuple):
 
 
 class VaryingBridge(NamedTuple):
-    """The sum of all crossings, and the data to give each its own bridge."""
+    """The sum of all crossings, and the data to add a change of the bridge to each."""
 
-    precision: FloatArray
-    linear: FloatArray
+    precision: FloatArray  # (n, n)
+    linear: FloatArray  # (n,)
     alike: tuple[_SameLayout, ...]
 
 

@@ -29,7 +29,7 @@ _USUAL_CHANGE = 0.03
 """Change of a parameter from run to run, in standard deviations of its prior: fuel, warm dampers,
 and the error of a normal likelihood."""
 _INCOMPATIBLE = 1e-4
-"""Probability of such a distance among all crossings below which a crossing is excluded."""
+"""Probability that the most distant of all crossings is as far away, below which it is excluded."""
 _FEWEST = 3
 """Fewest crossings of which one can be excluded: of two that contradict each other either may be
 wrong; of more, a third may be."""
@@ -56,7 +56,7 @@ class _VehicleInformation(NamedTuple):
 
 
 def find_misattributed(parts: Sequence[FusionInput], priors: BridgePriors) -> VehicleConsistency:
-    """Return the crossings recorded under another truck's name, and whether others contradict."""
+    """Return the crossings recorded under another truck's name, and whether others disagree."""
     trucks: dict[str, dict[str, _VehicleInformation]] = {}
     for part in sorted(parts, key=lambda part: part.name):
         trucks.setdefault(part.truck, {})[part.name] = _vehicle_information(part, priors)

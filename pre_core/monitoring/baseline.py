@@ -3,7 +3,7 @@
 Every period has an observation y of ln EI with own covariance R and loadings K on unit normals z
 that it shares with other periods (trucks, wheel-path groups, the other bridge parameters):
 
-    y = mu + beta (T - T_0) + drift + K z + own + change,
+    y = mu + beta (T - T_0) + drift + K z + own + change,    own ~ N(0, R),
     change ~ N(0, q^2 C),    drift: Ornstein-Uhlenbeck, standard deviation s, correlation time T_c,
 
 with C = (1 - rho) I + rho 1 1'. Without a temperature, beta (T - T_0) is replaced by an annual wave
@@ -79,8 +79,8 @@ class BaselineState(NamedTuple):
     log_weight: FloatArray
     """Logarithm (m,) of the posterior weight, normalised."""
     places: Mapping[str, slice]
-    """Position of each variable: level, drift, slope, season, change, and the names of shared
-    errors."""
+    """Indices of each variable in the state, by name: level, drift, slope, season, change, or the
+    name of a shared error."""
     scales: Scales
     time_days: float
 
@@ -90,8 +90,8 @@ class Innovation(NamedTuple):
 
     value: FloatArray  # (m, n)
     covariance: FloatArray  # (m, n, n) of it
-    across: FloatArray  # (n, size): how the observation depends on the state
-    gain: FloatArray  # (m, size, n): covariance of state and innovation
+    across: FloatArray  # (n, size): observation matrix
+    gain: FloatArray  # (m, size, n): covariance of state and innovation, not the Kalman gain
 
 
 def scales_compared() -> Scales:
@@ -202,7 +202,7 @@ def select_scales(state: BaselineState, kept: NDArray[np.bool_]) -> BaselineStat
 
 
 def standardised(state: BaselineState, innovation: Innovation) -> FloatArray:
-    """Return the innovation (n,) of all scales together over its standard deviation."""
+    """Return the innovation (n,), averaged over the scales, divided by its standard deviation."""
     weight = np.exp(state.log_weight)
     mean = weight @ innovation.value
     spread = np.diagonal(innovation.covariance, axis1=1, axis2=2) + (innovation.value - mean) ** 2
@@ -222,7 +222,7 @@ def with_change(state: BaselineState, spread: float) -> BaselineState:
 
 
 def change_of(state: BaselineState) -> tuple[FloatArray, FloatArray]:
-    """Return mean (n,) and covariance (n, n) of the change of `with_change`."""
+    """Return mean (n,) and covariance (n, n) of the change that `with_change` has added."""
     at = state.places[_CHANGE]
     weight = np.exp(state.log_weight)
     means = state.mean[:, at]
@@ -284,7 +284,7 @@ def _with_directions(period: Period, kept: Mapping[str, FloatArray]) -> Period:
 
 
 def _rows(state: BaselineState, period: Period) -> tuple[FloatArray, FloatArray]:
-    """Return the observation matrix (n, size) and the noise (n, n) in addition to q."""
+    """Return the observation matrix (n, size) and the noise covariance (n, n) without q."""
     of = period.observation
     n = of.value.size
     across = np.zeros((n, state.mean.shape[1]))

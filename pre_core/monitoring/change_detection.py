@@ -40,11 +40,12 @@ from pre_core.monitoring.chart import (
 
 SMALLEST_CHANGE = 0.05
 SEASON_DAYS = 364.0
-"""Time from the first period after which the season is known without temperatures."""
+"""Time after the first period from which the season is known without temperatures."""
 PROBABILITY = 0.975
 """Probability with which a change must exceed the smallest one of interest."""
 _UNLIKELY, _WORTHWHILE = 1e-6, 0.75
-"""Posterior weight below which scales are dropped, once fewer than the second share remain."""
+"""Posterior weight below which scales are dropped, and share of the scales below which the
+remaining ones must be for that to be worthwhile."""
 
 
 class AlarmRules(NamedTuple):
@@ -60,12 +61,12 @@ class AlarmRules(NamedTuple):
 
     @property
     def smallest(self) -> tuple[float, float]:
-        """The range of changes of ln EI that are too small to be of interest."""
+        """The limits of the changes of ln EI that are too small to be of interest: low, high."""
         return float(np.log1p(-self.at_least)), float(np.log1p(self.at_least))
 
     @property
     def threshold(self) -> float:
-        """The logarithm of the mean number of periods until a false alarm."""
+        """The threshold of ln R: the log of the mean number of periods until a false alarm."""
         return float(np.log(self.periods_per_year / self.false_alarms_per_year))
 
 
@@ -107,7 +108,7 @@ class MonitoringResult(NamedTuple):
     statistic: FloatArray
     """Chart statistic sqrt(2 ln R), (periods,); 0 where there is none."""
     threshold: float
-    """Threshold of the statistic."""
+    """Threshold of the statistic, in the same unit."""
     usual_change: float
     """Posterior root mean square of q, the standard deviation of ln EI between periods."""
     usual_drift: float
@@ -146,8 +147,8 @@ def detect_change(
 ) -> MonitoringResult:
     """Compare each period with all earlier ones, until an alarm.
 
-    `acknowledged`, in order, are acknowledged changes, whose state is the baseline of later
-    periods. During an alarm the baseline is not updated.
+    Changes in `acknowledged`, in order of time, are part of the baseline of later periods. During
+    an alarm the baseline is not updated.
     """
     count = len(periods)
     n = periods[0].observation.value.size if count else 0
@@ -239,9 +240,9 @@ def _without_unlikely_scales(state: BaselineState, chart: Chart) -> tuple[Baseli
 
 
 def compare_periods(first: Period, last: Period) -> PeriodDifference:
-    """Compare two periods directly, temperature and season included.
+    """Compare two periods without a correction for temperature, season or usual changes.
 
-    Shared errors cancel; errors of one period alone count.
+    Shared errors cancel; each period's own errors count.
     """
     plain = [period._replace(temperature_deg_c=0.0) for period in (first, last)]
     motionless = Scales(np.zeros(1), np.zeros(1), np.ones(1), np.zeros(1))
@@ -281,7 +282,7 @@ def _usual(state: BaselineState) -> tuple[float, float]:
 
 
 def _in_deviations(log_of_ratio: float) -> float:
-    """Return the standard deviations of a normal as unlikely: ln R = z²/2."""
+    """Return the deviate z of a standard normal that is as unlikely: ln R = z²/2."""
     return float(np.sqrt(2.0 * max(0.0, log_of_ratio)))
 
 

@@ -37,7 +37,7 @@ _ALL_KEPT = 8
 
 
 class Chart(NamedTuple):
-    """Possible beginnings (c) of a change and the statistics of later innovations for each."""
+    """The c possible beginnings of a change, and the statistics of later innovations for each."""
 
     begins: tuple[int, ...]
     """Numbers of periods."""
@@ -75,7 +75,10 @@ def select_chart_scales(chart: Chart, kept: NDArray[np.bool_]) -> Chart:
 def skip_period(
     chart: Chart, kept: FloatArray, drift: slice, weight: FloatArray, innovation: Innovation
 ) -> Chart:
-    """Return the chart after a period that is not tested; `kept` (m,), `weight` (m, size, n)."""
+    """Return the chart after a period that is not tested.
+
+    `kept` (m,), `drift` and `weight` (m, size, n) are as in `update_chart`.
+    """
     return chart._replace(response=_responded(chart, kept, drift, weight, innovation)[0])
 
 
@@ -90,9 +93,9 @@ def update_chart(
 ) -> Chart:
     """Return the chart after a period.
 
-    `number` is the period's, `kept` (m,) the remaining share of the drift since the previous one,
-    `weight` (m, size, n) the Kalman gain (None without an update), `inflation` the factor of the
-    innovation's covariance.
+    `number` is the period's, `kept` (m,) the remaining share of the drift since the previous
+    period, `drift` the drift's indices in the state, `weight` (m, size, n) the Kalman gain (None
+    without an update), `inflation` the factor of the innovation's covariance.
     """
     m, size, _, n = chart.response.shape
     chart = Chart(
@@ -162,7 +165,7 @@ def log_ratio(chart: Chart, state: BaselineState, number: int) -> tuple[float, F
 def chart_verdict(
     chart: Chart, state: BaselineState, number: int, smallest: tuple[float, float]
 ) -> ChartVerdict:
-    """Return the chart's result; a change is of interest outside of `smallest` (of ln EI).
+    """Return the chart's result; changes of ln EI within `smallest` (low, high) are of no interest.
 
     The probability is that of the element's own change, with all elements free to change, averaged
     over elements and beginnings by their probability.

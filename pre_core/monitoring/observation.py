@@ -45,10 +45,10 @@ class Observation(NamedTuple):
 def observation(
     part: FusionInput, priors: BridgePriors, ei_nm2: FloatArray, common_share: float
 ) -> Observation:
-    """Return a crossing's observation, relative to its rigidities (n,).
+    """Return a crossing's observation, linearised about rigidities `ei_nm2` (n,).
 
-    `common_share` is the shared fraction of the power of its mismatch's long waves in the
-    wheel-path group.
+    `common_share` is the share of the power of the mismatch's long waves that is common to the
+    crossings of its wheel-path group.
     """
     of, n = part.likelihood, priors.elements
     b, t = len(of.bridge.names), len(of.truck.names)
@@ -75,7 +75,7 @@ def observation(
     within = precision[np.ix_(x, x)] - across @ solved[:, :n] + _WEAK * np.eye(n)
     covariance = np.linalg.inv(within)
     found = covariance @ (linear[x] - across @ solved[:, n] + _WEAK * centre[x])
-    # P = half half', so that P^1/2 stands for half: any root does.
+    # `half` is a root of P = half half'; any root gives the same covariance.
     loading = covariance @ across @ solved[:, n + 1 :]
     own = covariance - loading @ loading.T
     if q:
@@ -95,7 +95,7 @@ def observation(
 def combine_observations(observations: list[Observation], elements: int) -> Observation:
     """Return several observations of one bridge as one, weighted by their own errors.
 
-    Raise ValueError without any.
+    Raise ValueError for an empty list.
     """
     if not observations:
         raise ValueError("no observations to fuse")
