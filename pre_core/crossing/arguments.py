@@ -39,7 +39,8 @@ class GriddedCrossing(NamedTuple):
     """Whether the tyre force is computed from the masses above it rather than from springs, dampers
     and axle; the results differ by the body equations."""
     swing_sample: int
-    """Sample of `EvaluationPoints.swing`, before the entry by more than the reach of `step`."""
+    """Sample at which the initial vibration (`EvaluationPoints.swing`) begins, before the entry by
+    more than the reach of `step`."""
     torsion: TorsionBasis = NO_TORSION
     lead: Lead = NO_LEAD
     """Front axle of a truck with a tandem; "front" and "rear" are then the axles of the tandem."""
@@ -47,7 +48,7 @@ class GriddedCrossing(NamedTuple):
 
 
 class EvaluationPoints(NamedTuple):
-    """Points (k) at which to evaluate; see `residuals.evaluate`.
+    """The k points at which residuals are evaluated (`residuals.evaluate`).
 
     A gain common to all sensors scales all measurements and changes no residual except by the
     static load, which is not measured: residuals stay in the sensors' own scale, and known loads
@@ -60,7 +61,7 @@ class EvaluationPoints(NamedTuple):
     acceleration_m_per_s2: FloatArray  # (k, n): positive when speeding up
     gain: FloatArray  # (k, 4): relative corrections, of mean zero
     common_gain: FloatArray  # (k,): factor by which all four sensors read too little
-    delay_s: FloatArray  # (k, 4): corrections, read from Taylor's series
+    delay_s: FloatArray  # (k, 4): corrections, applied by Taylor's series
     initial: FloatArray  # (k, 4, 3): displacement, velocity, bias to be added
     swing: FloatArray  # (k, 2 modes): see `deflection`
 
@@ -74,15 +75,15 @@ class Buffers(NamedTuple):
     feedback: FloatArray  # (groups, 5, 4)
     state: FloatArray  # (groups, 2, 4)
     force: FloatArray  # (wheels, stretch, 4)
-    lanes: FloatArray  # (wheels, stretch, 4)
+    lanes: FloatArray  # (wheels, stretch, 4): deflection by lane
     place: FloatArray  # (wheels, n): the compared two, and that ahead of a tandem
     part: NDArray[np.int64]  # (wheels, n)
-    corrected: FloatArray  # (4, 3, n)
-    load: FloatArray  # (wheels, n)
-    sharp: FloatArray  # (wheels, n)
-    road: FloatArray  # (2, n)
-    body: FloatArray  # (2, n)
-    begin: NDArray[np.int64]  # (rows,)
+    corrected: FloatArray  # (4, 3, n): displacement, velocity, acceleration of each channel
+    load: FloatArray  # (wheels, n): contact force on the bridge, up positive
+    sharp: FloatArray  # (wheels, n): the same, precompensated
+    road: FloatArray  # (2, n): deflection minus input profile
+    body: FloatArray  # (2, n): residuals of the body equations
+    begin: NDArray[np.int64]  # (rows,): see `residuals._locate_front_sample`, as the next
     between: FloatArray  # (rows,)
     residual: FloatArray  # (3, rows)
     row: FloatArray  # (filtered rows,)
@@ -95,7 +96,7 @@ class Buffers(NamedTuple):
 
 
 def allocate_buffers(crossing: GriddedCrossing, parameters: int, rows: RowFilter) -> Buffers:
-    """Allocate the work arrays for this crossing."""
+    """Allocate the work arrays for this crossing; `parameters` is the length p of theta."""
     parts, _, m = crossing.basis.cubics.shape
     groups = (m + LANES - 1) // LANES + GROUPS * crossing.torsion.ends_m.shape[0]
     n = crossing.signals.shape[2]

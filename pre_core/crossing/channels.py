@@ -26,8 +26,8 @@ Z, V, A, A_1, A_2, A_3 = range(6)
 """Indices of displacement, velocity, acceleration and its three derivatives."""
 
 MODEL_RATE_HZ = 340.0
-"""Highest rate of the model. Residuals up to 42 Hz have within 3 % the information on EI of those
-up to 125 Hz (docs/method-pre.md)."""
+"""Highest rate of the model. Residuals up to 42 Hz have the same information on EI as those up to
+125 Hz, within 3 % (docs/method-pre.md)."""
 _RATE_SHARE = 2.0
 """Largest rate of the model relative to the slowest sensor (`PASS_BAND`, `_SENSOR_PASS`)."""
 PASS_BAND, STOP = 0.215, 0.4
@@ -48,7 +48,7 @@ _DEGREE = 5
 
 
 class GainsAndDelays(NamedTuple):
-    """Relative gain errors and delays in s of the four channels of k trucks, (k, 4) each."""
+    """Relative gain errors and delays in s of the four channels at k points, (k, 4) each."""
 
     gain: FloatArray
     delay_s: FloatArray

@@ -1,10 +1,10 @@
 """Posterior of a crossing that determines its elements poorly, normal in 1/EI.
 
 Deflections are linear in the compliances c = EI_nominal/EI, exactly for a statically determinate
-bridge. So with all other coordinates x, and c in place of ln EI, the residuals are r + J (x - x_0)
-far beyond their linear range in ln EI. With the log-normal priors of EI, the priors at zero and the
-point masses of absence, this density is cheap, and close to the posterior even where an element is
-known only to a factor of several.
+bridge. So the residuals, as a function of coordinates x with c in place of ln EI, are r + J (x -
+x_0) far beyond the range in which they are linear in ln EI. With the log-normal priors of EI, the
+priors at zero and the point masses of absence, this density is cheap, and close to the posterior
+even where an element is known only to a factor of several.
 
 It is sampled by a Gibbs sampler: all coordinates that are conditionally normal are integrated
 out; elements are drawn by slice sampling (Neal 2003); the conditional of a coordinate that may be
@@ -33,6 +33,7 @@ from pre_core.kernels.lanes import inner, kernel
 from pre_core.search.convergence import CHAINS
 
 _SETTLING = 500
+"""Sweeps of burn-in before the first draw."""
 _SWEEPS = 60
 """Sweeps between two draws, because neighbouring elements are strongly correlated."""
 MISMATCH_BIAS_SPREAD = 0.25
@@ -64,7 +65,7 @@ class CompliancePosterior(NamedTuple):
     inflation: float
     precision: FloatArray  # (k, k) of the sampled, the others integrated out
     linear: FloatArray  # (k,)
-    log_odds: FloatArray  # (k,) of being exactly zero, against the density per unit
+    log_odds: FloatArray  # (k,) see `posterior.log_odds_of_absence`
     others_root: FloatArray
     """Lower triangle M (others, others): M' M is the covariance of the others given `sampled`."""
     others_linear: FloatArray
@@ -130,7 +131,11 @@ def compliance_normal(found: Optimum) -> ComplianceNormal:
 def marginal(
     precision: FloatArray, linear: FloatArray, sampled: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return precision and linear part of the marginal of a normal (f, f), (f,)."""
+    """Return precision (k, k) and linear part (k,) of the coordinates `sampled` (k,) alone.
+
+    All other coordinates of the normal with this precision (f, f) and linear part (f,) are
+    integrated out.
+    """
     others = np.delete(np.arange(linear.size), sampled)
     factor = cho_factor(precision[np.ix_(others, others)], lower=True)
     across = precision[np.ix_(others, sampled)]
@@ -232,7 +237,7 @@ def draws(
 
 
 def present_points(found: Optimum, count: int, inflation: float, seed: int) -> FloatArray:
-    """Return points (k, f) of the density about an optimum, `count` at least, nothing absent."""
+    """Return at least `count` points (k, f) of the density about an optimum, without absence."""
     near = compliance_posterior(found, inflation)
     near = near._replace(log_odds=never_absent(near.log_odds))
     each = -(-count // CHAINS)
@@ -240,7 +245,7 @@ def present_points(found: Optimum, count: int, inflation: float, seed: int) -> F
 
 
 def never_absent(log_odds: FloatArray) -> FloatArray:
-    """Return log odds (n,) without chance of absence: only what the site file excludes is zero."""
+    """Return log odds (n,) that exclude absence, except where the site file excludes presence."""
     return np.where(np.isposinf(log_odds), log_odds, -np.inf)
 
 
@@ -320,7 +325,7 @@ def _truncated_draw(rng: np.random.Generator, pull: float, own: float, log_odds:
     mean = pull / own
     at = mean / scale
     if log_odds > -np.inf:
-        # Mass above zero over the density at zero; far below, what is left of it is scale/-at.
+        # Mass above zero over the density at zero; for a mean far below zero it is scale/-at.
         if at > -6.0:
             above = log(scale * sqrt(2.0 * np.pi) * 0.5 * (1.0 + erf(at / sqrt(2.0))))
             above += 0.5 * at * at

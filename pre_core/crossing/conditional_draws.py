@@ -1,16 +1,16 @@
-"""Posterior draws of a crossing on one profile: few coordinates by residuals, others given these.
+"""Posterior draws of a crossing on one profile: a few coordinates first, the others given these.
 
 Of about eighty coordinates those of bridge, wheelbase and delays have effects that are not linear;
 badly known supports and rigidities bend the posterior so far that no normal is close to it
 (`surrogate`). Given these and one offset, all others (truck, initial states, trajectory, gains and
 the bridge's vibration before the crossing) are nearly normal: they are integrated out of the
 residuals, whose surface proposes draws (`residual_draws`), and drawn from that normal. Draws are
-weighted by the posterior of all coordinates, so that what is not quite linear costs draws and no
-accuracy.
+weighted by the posterior of all coordinates, so that slight nonlinearity costs effective draws, but
+no accuracy.
 
 The vibration before the crossing is a wave of the bridge's own frequency. Its effect is computed
 for each draw, and so is the determinant of its normal, which distinguishes bridges: without it
-elements were off by a standard deviation.
+elements are off by a standard deviation.
 """
 
 from functools import partial
@@ -40,8 +40,10 @@ _WIDER = 1.2
 _POINTS_PER_TERM = 1.2
 """Number of first points for each term of the surface."""
 _ROUNDS = 5
+"""Largest number of rounds of `residual_draws`."""
 _LEVEL = 10.0
-"""Residual of the determinant at the optimum: half its square bounds how far it may be above."""
+"""Residual that stands for the determinant at the optimum: half its square bounds the log density
+that a smaller determinant adds."""
 
 
 class ConditionalDraws(NamedTuple):
@@ -57,7 +59,7 @@ class _Partition(NamedTuple):
     problem: PosteriorProblem
     y: FloatArray  # (f,) the optimum, without vibration
     inflation: float
-    kept: NDArray[np.int64]  # (n + 1,) what is drawn by residuals, the offset last
+    kept: NDArray[np.int64]  # (n + 1,) coordinates that are drawn first, the offset last
     linear: NDArray[np.int64]  # (s,) without vibration
     swing: NDArray[np.int64]  # (w,) vibration before the crossing
     rows: NDArray[np.int64]  # (m,) residuals without the priors of `kept`
@@ -70,7 +72,7 @@ class _Partition(NamedTuple):
 class _Integrated(NamedTuple):
     """One point with its linear coordinates integrated out."""
 
-    residual: FloatArray  # (m,) what no linear coordinate explains
+    residual: FloatArray  # (m,) the part that no linear coordinate explains
     log_determinant: float  # of the precision of the vibration
     root: FloatArray  # (w, w) upper triangle of that precision
     swing: FloatArray  # (w,) mean of the vibration

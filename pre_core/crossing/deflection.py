@@ -18,7 +18,7 @@ from pre_core.physics.beam_basis import ModalFilters
 from pre_core.physics.torsion import flexibility_remainder, torsion_filters
 
 SWING_MODES = 3
-"""Number of modes with initial vibration; a load excites the j-th by 1/j^2 of the first."""
+"""Number of modes with initial vibration; a load excites higher ones less (`posterior`)."""
 
 
 @inner

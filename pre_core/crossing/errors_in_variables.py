@@ -50,7 +50,8 @@ class MismatchWeights(NamedTuple):
     """Weights (4, 4, f) of the equations (`noise.estimation_matrix`) of any truck."""
     torsion: TorsionBasis
     receptance: NDArray[np.complex128]
-    """Mean receptance (f,) of the twisting deck at the flexibility of the first truck's bridge."""
+    """Mean receptance (f,) of the twisting deck at unit flexibility, damped as in the first truck's
+    theta."""
 
 
 def mismatch_weights(

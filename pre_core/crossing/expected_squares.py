@@ -4,7 +4,7 @@ Noise that is whitened for one truck has other expected squares for another (`po
 `errors_in_variables`), and so biases the search towards trucks that transmit less. A search
 subtracts the tangent of these squares at its own truck. Draws go further: the loads on both axles
 and the stiffness of their springs may together be a third off, where the squares are far from their
-tangent. The extrapolated tangent made some bridges e^90 times likelier, although their fit was
+tangent. The extrapolated tangent makes some bridges e^90 times likelier, although their fit is
 worse by 100 times the noise.
 """
 

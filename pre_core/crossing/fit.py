@@ -51,12 +51,13 @@ HOPELESS_CHI2 = 25.0
 """Value of chi2 above which a fit is not repeated with other noise or free ends, and above which,
 after two offsets, no third one is tried."""
 _MAX_ROUNDS, _EARLY_ROUNDS = 6, 2
-"""Limit of alternating fits and noise estimates, finally and in earlier stages."""
+"""Limits of alternating fits and noise estimates: in the last stage and in earlier ones."""
 _MAX_STEPS, _EARLY_STEPS = 25, 8
-"""Limit of steps with mismatch, whose noise is estimated before every step; finally and earlier."""
+"""Limits of steps with mismatch, whose noise is estimated before every step: in the last stage and
+in earlier ones."""
 _MORE_STEPS = 50
-"""Limit of further steps where the first ones ended at a fit: a valley of a drive over equal tyres
-took 37, and the same drive at another time of day fewer than 25."""
+"""Limit of further steps where the first ones ended at an accepted fit: the valley of one crossing
+with equal tyres took 37, that of the same crossing at another time of day fewer than 25."""
 _MIN_IMPROVEMENT_WITH_MISMATCH = 0.5
 """Improvement of the sum of squares that ends a search with mismatch, far within the uncertainty of
 poorly determined parameters."""
@@ -90,7 +91,7 @@ class SearchStrategy(NamedTuple):
 
 
 RefreshNoise = Callable[[PosteriorProblem, FloatArray], PosteriorProblem]
-"""Function that returns the problem with its noise for another point."""
+"""Function that returns the problem with its noise estimated at a point y (f,)."""
 
 
 class Optimum(NamedTuple):
@@ -117,7 +118,7 @@ class Optimum(NamedTuple):
 
 
 def chi2_per_dof(problem: PosteriorProblem, y: FloatArray) -> float:
-    """Return the mean square of whitened residuals at y (size,), per degree of freedom.
+    """Return the mean square of whitened residuals at y (f,), per degree of freedom.
 
     Each search coordinate and each removed wave takes one degree of freedom. With reduced weight of
     the body equations only the mismatch residuals count, and a third of these coordinates and
@@ -207,14 +208,14 @@ def is_accepted(problem: PosteriorProblem, chi2: float) -> bool:
 
 
 def is_better_misfit(chi2: float, last: float) -> bool:
-    """Return whether another fit is worthwhile after one that lowered chi2 from `last` to this."""
+    """Return whether another fit is worthwhile after one that took chi2 from `last` to `chi2`."""
     return chi2 <= max(_CLEAR_MISFIT_CHI2, (1.0 - SMALL_IMPROVEMENT) * last)
 
 
 def fit_all(
     problem: PosteriorProblem, y: FloatArray, strategy: SearchStrategy
 ) -> tuple[Optimum | None, int]:
-    """Fit all parameters from y (size,); return the optimum, if there is one, and evaluations.
+    """Fit all parameters from y (f,); return the optimum, if there is one, and evaluations.
 
     Negative stiffness and damping coordinates are fixed at zero, and the others brought to the
     neighbouring optimum. `normal_approximation` accounts for the remaining gradient.
@@ -277,7 +278,7 @@ def complete_fit(found: Optimum) -> Optimum:
 
 
 def _completed(problem: PosteriorProblem, y: FloatArray, strategy: SearchStrategy) -> Optimum:
-    """Return the optimum to which y (size,) leads after the first stage."""
+    """Return the optimum to which y (f,) leads after the first stage."""
     ending, evaluations = Termination.STEPS_EXHAUSTED, 0
     free = np.eye(y.size)
     if not problem.force.any():
@@ -335,8 +336,8 @@ def _fit_in_noise_rounds(
 ) -> tuple[PosteriorProblem, FloatArray, Termination, int]:
     """Fit from y until the noise estimated from the residuals converges.
 
-    `refresh_noise` gives the problem with its noise at another y: without mismatch after a fit, in
-    `rounds` at most; with mismatch before every step (`_fit_in_noise_steps`).
+    `refresh_noise` estimates it: without mismatch after each of at most `rounds` fits, with
+    mismatch before every step (`_fit_in_noise_steps`).
     """
     temperature, steps, enough = _FREE_STAGES[-1]
     evaluations = 0

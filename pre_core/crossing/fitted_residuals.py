@@ -37,7 +37,7 @@ class FittedValues(NamedTuple):
     theta: FloatArray
     """Parameters (p,) in the order of `pre_core.parameters`; nominal where a value is unknown."""
     shift_m: float
-    """Slow error of the receiver."""
+    """Longitudinal offset of the truck's positions, the slow error of the receiver."""
     has_mismatch: bool
     """Whether the fit modelled profile mismatch."""
     uses_suspension: bool
@@ -84,7 +84,7 @@ def fitted_residuals(inputs: CrossingInputs, found: FittedValues) -> FittedResid
 
 
 def _coordinates(problem: PosteriorProblem, y: FloatArray, found: FittedValues) -> FloatArray:
-    """Return y (size,) with the estimate in it, other coordinates unchanged."""
+    """Return y (f,) with the estimated values, other coordinates unchanged."""
     where, priors = layout(problem), problem.priors
     y = y.copy()
     y[where.theta] = to_standardised(priors, found.theta)

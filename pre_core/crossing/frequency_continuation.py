@@ -2,12 +2,13 @@
 
 A bridge that vibrates at a wrong frequency is a local minimum: its oscillation slips by a period
 against the measured one, and each small change fits worse. Equal tyres on both axles leave so
-little noise that a quarter of the searches ended there, up to 350 in the log posterior below the
-true bridge, and yet were accepted. Below the first frequency the deflection is nearly static:
-linear in the compliances of elements and bearings. So bridges are fitted to the residuals below a
-frequency that is doubled stage by stage, each of which brings the next oscillation within half a
-period (frequency continuation, as in seismic inversion: Bunks, Saleck, Zaleski and Chavent 1995).
-Truck and trajectory follow to first order, except for the offset.
+little noise that a quarter of the searches without this method end there and are accepted, although
+the log posterior is up to 350 below that of the true bridge. Below the first frequency the
+deflection is nearly static: linear in the compliances of elements and bearings. So bridges are
+fitted to the residuals below a frequency that is doubled stage by stage, each of which brings the
+next oscillation within half a period (frequency continuation, as in seismic inversion: Bunks,
+Saleck, Zaleski and Chavent 1995). Truck and trajectory follow to first order, except for the
+offset.
 """
 
 from collections.abc import Iterator
@@ -47,8 +48,10 @@ _FEWEST_WAVES = 8
 _SMALLEST_COMPLIANCE = 0.1
 """Smallest compliance of an element in a fit, relative to the nominal one."""
 _LARGEST_SHARE = 0.99
+"""Largest share y/(1 + y) of a rotational restraint in a fit."""
 _SAME_BRIDGE = 0.3
-"""Distance of two bridges, in spreads of their priors and metres, that are one."""
+"""Distance below which two bridges count as one, in standard deviations of the priors and in m of
+the offset."""
 
 
 class OtherBridge(NamedTuple):
@@ -57,7 +60,7 @@ class OtherBridge(NamedTuple):
     gain: float
     """Sum of squares at the optimum minus that here."""
     y: FloatArray
-    """The point (f,) with this bridge and its offset, everything else as it was."""
+    """The point (f,) with this bridge and its offset, all else as at the optimum."""
 
 
 class _Coordinates(NamedTuple):
@@ -93,7 +96,7 @@ class _Coordinates(NamedTuple):
 def other_bridges(
     found: Optimum, strategy: SearchStrategy, *, is_even: bool
 ) -> tuple[list[OtherBridge], int]:
-    """Return bridges that fit about as well as an optimum, best first; and evaluations.
+    """Return bridges that fit about as well as an optimum, best first, and count evaluations.
 
     They are fitted from elements of nominal rigidity on bearings that are free or restrained, rigid
     or compliant: both ends alike if `is_even`, else one end at a time. The noise is that of a deck
@@ -197,7 +200,7 @@ class _ContinuedFit:
         return float(np.sum(self._residuals(start[None, :]) ** 2))
 
     def run(self, start: FloatArray, stages_hz: tuple[float, ...]) -> tuple[float, FloatArray]:
-        """Return the sum of squares and y (f,) of the bridge fitted stage by stage, last to all."""
+        """Return sum of squares and y (f,) of a bridge fitted in stages, last to all residuals."""
         u = self._at.from_y(start)
         for up_to_hz in stages_hz:
             u, _ = self._stage(u, up_to_hz, _STEPS)
@@ -208,12 +211,12 @@ class _ContinuedFit:
         return objective, y
 
     def _residuals(self, moved: FloatArray) -> FloatArray:
-        """Return residuals (k, rows) at coordinates (k, n + 1) in y that no other one explains."""
+        """Return residuals (k, rows) at (k, n + 1) without the part that others explain."""
         rows = self._rows(moved)
         return np.asarray(rows - (rows @ self._others) @ self._others.T)
 
     def _stage(self, u: FloatArray, up_to_hz: float, steps: int) -> tuple[FloatArray, float]:
-        """Return the coordinates fitted to mismatch residuals below a frequency, and squares."""
+        """Return u fitted to the mismatch residuals below a frequency, and the sum of squares."""
 
         def residuals(points: FloatArray) -> FloatArray:
             rows = self._residuals(self._at.to_y(points))

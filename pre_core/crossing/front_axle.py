@@ -17,7 +17,8 @@ this and the roughness of the deck (`pavement.estimate_pavement`): the bridge's 
 as short as that roughness, and would be mistaken for it. In the few bands in which the bridge
 responds, the noise is many times that of the sensors; it would be mistaken for damping or for
 rotational restraint. All runs over one lane have the same e, which therefore does not average out:
-in a fusion its power counts `RUNS` times. Errors of the axle's mass and tyre add to the covariance.
+in a fusion its power counts `RUNS` times. Errors of the axle's declared values (mass and tyre) add
+to the covariance.
 """
 
 from typing import Final, NamedTuple
@@ -40,12 +41,13 @@ RUNS: Final = 12.0
 """Number of runs over one profile for which fusion is exact; it is conservative with fewer."""
 _HIGHEST_HZ = 15.0
 _LONGEST_KNOTS = 160
-"""Largest number of values of a force; it lowers the highest frequency of a slower truck's."""
+"""Largest number of knots of a force; it lowers the highest frequency for a slow truck."""
 _OVERSAMPLED = 16
 """Frequencies for each value in the integral of the covariance."""
 _SMALLEST = 0.05
-"""Smallest noise of a direction relative to the sensors' that is kept."""
+"""Smallest noise of a direction, relative to the sensors' noise, that is kept."""
 _JITTER = 1e-9
+"""Relative increase of the covariance's diagonal that keeps it positive definite."""
 
 
 class FrontAxleResponse(NamedTuple):
@@ -57,11 +59,12 @@ class FrontAxleResponse(NamedTuple):
     """Covariance (K, K) in m²/s^4 of the acceleration's error at the knots, where the surface under
     the axle is as rough as off the bridge."""
     of_values: FloatArray
-    """Covariance (K, K) in m²/s^4 that errors of the axle's values cause, for its nominal mass."""
+    """Covariance (K, K) in m²/s^4 that errors of the axle's declared values cause, expressed as
+    acceleration of its nominal mass."""
 
 
 def front_axle_response(problem: PosteriorProblem, y: FloatArray) -> FrontAxleResponse | None:
-    """Return the response at y (size,), while the front axle is on the bridge.
+    """Return the response at y (f,), while the front axle is on the bridge.
 
     It is None for a truck without a tandem, without road off the bridge that shows how rough the
     surface is, and if the truck at y has no residuals.
@@ -155,12 +158,12 @@ def _unit_motions(problem: PosteriorProblem, y: FloatArray) -> tuple[FloatArray,
 def _of_displaced_values(
     problem: PosteriorProblem, y: FloatArray, apart_s: float, count: int
 ) -> FloatArray:
-    """Return the covariance (K, K) in m²/s^4 at `count` knots that displaced values cause.
+    """Return the covariance (K, K) in m²/s^4 at `count` knots from errors of the axle's values.
 
-    The error of the inertia force that each causes is known but for its factor. It is treated as
-    random with the spectrum that it has in the record: it contains the sensors' noise, which is in
-    the residuals too, and as columns of the noise the errors would bias the estimate. What a
-    displaced mass changes in the loads of the body is left to the unknown place of its centre.
+    The error of the inertia force that each value causes is known but for a factor. It is treated
+    as random, with the spectrum that it has in the record: it contains the sensors' noise, which is
+    in the residuals too, so that known columns would bias the estimate. The effect of a mass error
+    on the loads of the body is left to the uncertainty of the centre of gravity.
     """
     lead = problem.crossing.lead
     nominal = with_lead_motion(problem, y).crossing.lead_acceleration
@@ -206,7 +209,7 @@ def _acceleration_power(problem: PosteriorProblem, surface: float, hz: FloatArra
 
 
 def with_lead_motion(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
-    """Return the problem with the motion of the axle ahead of the tandem, at y (size,)."""
+    """Return the problem with the motion of the axle ahead of the tandem, at y (f,)."""
     crossing = problem.crossing
     at = points(problem, y[None, :])
     work = problem.works[0]

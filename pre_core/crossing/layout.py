@@ -13,11 +13,12 @@ CHANNELS = 4
 
 
 class ParameterLayout(NamedTuple):
-    """Indices of the groups of parameters in y."""
+    """Indices in y of groups of search coordinates."""
 
     theta: slice
+    """Indices of the estimated parameters of truck and bridge."""
     bridge: NDArray[np.int64]
-    """Indices of the bridge's parameters in theta; `elements` are the last ones."""
+    """Indices of the bridge's estimated parameters; `elements` are the last ones."""
     elements: NDArray[np.int64]
     half_normal: NDArray[np.int64]
     """Indices of coordinates that must not be negative."""
@@ -27,16 +28,24 @@ class ParameterLayout(NamedTuple):
     common_gain: int
     delays: slice
     initial: slice
+    """Indices of displacement, velocity and bias at the beginning, three for each channel."""
     swing: slice
     """Indices of the initial vibration of the bridge."""
     trajectory: slice
+    """Indices of the coefficients of the trajectory's spline."""
     offset: int
+    """Index of the slow error of the receiver, in m."""
     size: int
+    """Number f of search coordinates."""
 
 
 @lru_cache(maxsize=8)
 def parameter_layout(estimated: bytes, half_normal: bytes, coefficients: int) -> ParameterLayout:
-    """Return the layout for flags (p,) and spline coefficients; cached for every evaluation."""
+    """Return the layout for flags (p,) as bytes, and a number of spline coefficients.
+
+    Flags are `estimated` parameters and those with a `half_normal` prior. Results are cached,
+    because every evaluation needs one.
+    """
     kept = np.flatnonzero(np.frombuffer(estimated, dtype=np.bool_))
     t = kept.size
     gains = slice(t + 1, t + 4)

@@ -31,28 +31,28 @@ _WITHIN_HZ, _BESIDE_HZ = 0.4, 2.5
 _WITHIN_BINS = 2.5
 """Half width of a line in a short record, by Hann's window."""
 _MIN_PROMINENCE = 30.0
-"""Smallest peak of a line in the periodogram over the mean of the adjacent frequencies. For noise
-alone the highest of a record is 10 times that; wheel hop has peaks 1 Hz wide and more."""
+"""Smallest ratio of a line's peak in the periodogram to the mean of the adjacent frequencies. For
+noise alone the highest ratio in a record is 10; wheel hop has peaks 1 Hz wide and more."""
 _FEWEST = 40
 """Fewest frequencies for a detection."""
 _PARTS = 4
 _STEADY = 0.25
-"""Smallest power of a line in a quarter of the record over that in the mean quarter."""
+"""Smallest ratio of a line's power in a quarter of the record to its mean over the quarters."""
 _PEAKS = 4
 """Number of highest peaks that are tested."""
 
 
 class _Spectra(NamedTuple):
-    """Periodogram (f, kinds) of residuals at frequencies (f,), each over the median nearby."""
+    """Periodogram (f, kinds) of residuals at frequencies (f,), each kind divided by its median."""
 
     hz: FloatArray
     power: FloatArray
 
 
 def line_waves(lines_hz: Sequence[float], count: int, apart_s: float) -> FloatArray:
-    """Return orthonormal columns (count, w) that span waves of all frequencies at the residuals.
+    """Return orthonormal columns (count, w) that span waves of all lines at the residuals.
 
-    Cosine and sine of each line, times cubic splines with knots a second apart.
+    The waves are cosine and sine of each line, times cubic splines with knots a second apart.
     """
     time = apart_s * np.arange(count, dtype=np.float64)
     spans = max(1, round(float(time[-1]) / _KNOT_S))

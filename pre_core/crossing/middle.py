@@ -4,8 +4,8 @@ Body and axles are rigid. A sensor on the body, a distance o behind the front ax
 of the middle, reads (1 - o/D) z_1 + o/D z_2 + e phi of the accelerations z_1 and z_2 above the
 axles, D apart, and of the roll phi; a sensor on an axle reads z_u + e phi_u. The coordinates of
 each part follow by least squares, weighted by the sensors' noise. z_1, z_2 and both z_u are the
-middle readings. Where the noise of z_1 and z_2 is correlated (sensors far from the axles) the
-method assumes independence.
+middle readings. The method neglects the correlation that the noise of z_1 and z_2 has if sensors
+are far from the axles.
 """
 
 from typing import NamedTuple
@@ -87,7 +87,7 @@ def centre_reduction(
 
 
 def _exact(weights: FloatArray) -> FloatArray:
-    """Return weights with rounded 0 and 1."""
+    """Return weights (m,) in which values within rounding of 0 and 1 are exact."""
     near = np.rint(weights)
     return np.where(np.abs(weights - near) < _ROUNDING, near, weights)
 

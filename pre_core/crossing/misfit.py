@@ -31,7 +31,7 @@ class OffBridgeFit(NamedTuple):
 
     y: FloatArray
     chi2: float
-    """Mean square of these residuals per degree of freedom, infinite without any."""
+    """Sum of squares of these residuals per degree of freedom; infinite if there are none."""
     evaluations: int
 
 
@@ -57,7 +57,7 @@ def fit_off_bridge(found: Optimum) -> OffBridgeFit:
 
 
 def _fit_once(problem: PosteriorProblem, y: FloatArray) -> OffBridgeFit:
-    """Return the fit from y (size,) with the noise of the problem."""
+    """Return the fit from y (f,) with the noise of the problem."""
     count = problem.noise.reciprocal.size
     is_off = np.zeros(count // RESIDUALS, dtype=np.bool_)
     for one in off_bridge_residuals(problem, y):

@@ -38,6 +38,7 @@ _LARGE_OFFSET_M = 0.02
 """Root mean square of the offset's prior: axles are aligned to millimetres, and steer to
 centimetres. Without it an offset of a hand's width would pass for twin tyres."""
 _WORN = 0.9
+"""Width of a worn tyre relative to an equal one."""
 _GRID_CYCLES_PER_M = 0.02
 TRACK_SHAPES = 2
 """Number of spectra that belong to the axles' tracks: of unequal tyres, and of an offset."""
@@ -46,7 +47,7 @@ _CLEAR_ROLL = 10.0
 the mean, above 10 in one; of 30 with a damping ratio of 0.05, 22 in the mean."""
 _ROLL_STEP = 0.125
 _ROLL_BANDS = np.exp(_ROLL_STEP * np.arange(0, 7))
-"""Middles of the bands of the axles' roll relative to the frequency of an axle on its tyres. The
+"""Centres of the bands of the axles' roll relative to the frequency of an axle on its tyres. The
 roll inertia of an axle is 0.3 to 0.9 of its mass times half the track squared."""
 _MAX_CYCLES_PER_M = 24.0
 LONG_CYCLES_PER_M = 0.05
@@ -55,8 +56,9 @@ _EVERY_LONG, _OTHERS = 30, 50
 """Number of longest grid waves, and of others, for which the shared part is computed; it is smooth.
 """
 _SURFACE_CYCLES_PER_M = (0.5, 4.0)
+"""Band from which the level of the surface is estimated."""
 _TILTED_CYCLES_PER_M, _PIVOT_CYCLES_PER_M = (0.05, 4.0), 1.0
-"""Waves between which the pavement of a bridge is tilted, and n_p."""
+"""Limits of n in L(n), and n_p, see `crossing.pavement`."""
 _ENOUGH = 1e-4
 _NOTHING = 1e-12
 
@@ -74,7 +76,7 @@ class MismatchSpectra(NamedTuple):
     """Cross spectrum (s, g) of the front axle's profile with d, not windowed."""
     rear_cross_spectrum_density: FloatArray
     """Cross spectrum (s, g) of the rear axle's profile with d: that of the front axle minus the
-    spectrum of d before windowing, which would fill its zero at the contact length."""
+    spectrum of d before windowing. Windowing would fill the zero at the contact length."""
     footprints: tuple[Footprint, Footprint]
     road: FloatArray
     """Windowed profile spectrum (g,) of the front axle on a surface of Phi k^3 = 1 m²."""
@@ -82,7 +84,7 @@ class MismatchSpectra(NamedTuple):
     """Ratio (g,) of `road` to the unwindowed spectrum: the window spreads the longest waves, by far
     the highest."""
     expected_m: FloatArray
-    """Expected levels (s,) in m³, divided by Phi k^3: of the given tyres, and of an offset of
+    """Expected levels (s,) in m³ over Phi k^3 in m², for the given tyres and for an offset of
     `_LARGE_OFFSET_M`."""
 
 
@@ -179,8 +181,8 @@ def with_axle_roll(shapes: MismatchSpectra, hop_hz: float, speed_m_per_s: float)
 def expected_levels(front: Footprint, rear: Footprint, road_class: str) -> FloatArray:
     """Return the levels (s,) in m³ on a surface of an ISO 8608 class under these axles.
 
-    Equal tyres have no mismatch: `mismatch_spectra` treats them as worn, because no run can exclude
-    it.
+    Equal tyres have the level zero here; `mismatch_spectra` treats them as worn, because no run can
+    exclude wear.
     """
     at = np.array([REFERENCE_CYCLES_PER_M])
     single, unlike = front._replace(offset_m=0.0), rear._replace(offset_m=0.0)
@@ -272,14 +274,14 @@ def has_alike_tyres(mismatch: Mismatch) -> bool:
 
 
 def long_wave_power(mismatch: Mismatch) -> float:
-    """Return the expected power on the bridge over that off it, at `LONG_CYCLES_PER_M`."""
+    """Return the ratio of expected power on the bridge to that off it, at `LONG_CYCLES_PER_M`."""
     if mismatch.pavement is None:
         return 1.0
     return float(_power_ratio(mismatch.pavement, np.array([LONG_CYCLES_PER_M]))[0])
 
 
 def _power_ratio(pavement: BridgePavement, cycles_per_m: FloatArray) -> FloatArray:
-    """Return the expected power (g,) on the bridge over that off it, at frequencies (g,)."""
+    """Return the ratio (g,) of expected power on the bridge to that off it, at frequencies (g,)."""
     tilt = tilt_of(cycles_per_m)
     columns = np.stack([np.ones_like(tilt), tilt], axis=1)
     variance = np.einsum("gi,ij,gj->g", columns, pavement.covariance, columns)
@@ -287,7 +289,10 @@ def _power_ratio(pavement: BridgePavement, cycles_per_m: FloatArray) -> FloatArr
 
 
 def on_bridge(mismatch: Mismatch) -> Mismatch:
-    """Return the mismatch as it is expected on the bridge, as one shape of level 1."""
+    """Return the mismatch expected on the bridge, as one shape of level 1.
+
+    Without a `pavement` it is the given one, with all its shapes.
+    """
     if mismatch.pavement is None:
         return mismatch
     shapes = mismatch.shapes
@@ -302,14 +307,14 @@ def on_bridge(mismatch: Mismatch) -> Mismatch:
 
 
 def pavement_ratio(mismatch: Mismatch) -> float:
-    """Return the estimated amplitude on the bridge over that off it, in waves of a metre."""
+    """Return the ratio of estimated amplitude on the bridge to that off it, in waves of a metre."""
     return 1.0 if mismatch.pavement is None else float(np.exp(mismatch.pavement.ratio_and_tilt[0]))
 
 
 def two_parameter_spectrum(mismatch: Mismatch) -> tuple[float, float]:
     """Return A (m³) and n_0 (cycles/m) of A/(1 + (n/n_0)²)² similar to the spectrum of d.
 
-    A is the spectrum at waves of 20 m; at n_0 it has fallen to a quarter of that.
+    A is the spectrum at waves of 20 m; n_0 is the frequency at which it has fallen to a quarter.
     """
     density = mismatch.level_m3 @ mismatch.shapes.density
     grid = mismatch.shapes.cycles_per_m
@@ -324,11 +329,11 @@ def correlation_time_s(mismatch: Mismatch) -> float:
 
 
 class PeriodogramSegment(NamedTuple):
-    """Periodogram of a segment of residuals (f,), and its expectation by source (f,), (s, f)."""
+    """Periodogram of a segment of residuals, and its expectation by source."""
 
-    seen: FloatArray
-    sensors: FloatArray
-    shapes: FloatArray
+    seen: FloatArray  # (f,): periodogram
+    sensors: FloatArray  # (f,): expectation from sensor noise
+    shapes: FloatArray  # (s, f): expectation from each shape of unit level
 
 
 def hann_taper(count: int) -> FloatArray:
@@ -390,8 +395,8 @@ def estimate_levels(
 
     `typical` (s,) are the means of their exponential priors, infinite without one; the statistic is
     that of `maximum_likelihood_levels`. The last `bands` of the levels, of axles that roll, are
-    zero unless they raise it by `_CLEAR_ROLL`: free levels would take what chance adds in a band,
-    and the others would be a tenth too low.
+    zero unless they raise the statistic by `_CLEAR_ROLL`: free levels would absorb the excess by
+    chance in a band, and the others would be a tenth too low.
     """
     if bands == 0:
         return _most_likely_levels(segments, typical)

@@ -2,7 +2,8 @@
 
 There are three kinds of residuals, all as displacements: the profile mismatch and the two body
 equations divided by k_s (by a constant where their weight is reduced: `body_divisors`). White
-acceleration noise of densities n_s, n_u enters them as
+acceleration noise of one-sided amplitude densities n_s, n_u in m/s²/√Hz (the argument `density`
+(4,) of the functions below: s1, s2, u1, u2) enters them as
 
     s^2 R_i   : [1 + (m_u s^2 + c_s s + k_s)/K] n_u - [(c_s s + k_s)/K] n_s,  K = k_u + c_u s
     s^2 b_i   : [(m_ii s^2 + c_s s)/k_s + 1] n_s - [c_s s/k_s + 1] n_u + [m_12 s^2/k_s] n_s'
@@ -63,8 +64,9 @@ FRICTION_STATISTIC, FRICTION_STATISTIC_OF_MISFIT = 60.0, 15.0
 body equations: the second where nothing else explains a misfit. Of 400 axles with sensor
 noise alone twelve had more than 15, none more than 60."""
 _EQUAL_TYRES = 0.05
-"""Sensitivity to unequal tyres below which tyres count as equal; the mismatch is then an axle's
-offset, whose long waves are twice as large, and which short ones hardly distinguish."""
+"""Level of unequal tyres, relative to the declared tyres' level, below which tyres count as equal.
+The mismatch is then that of an axle's offset, whose long waves are twice as large; short waves
+hardly distinguish the two."""
 
 
 class NoisePath(NamedTuple):
@@ -75,7 +77,7 @@ class NoisePath(NamedTuple):
     m_22: float
     m_12: float
     is_inertial: bool
-    """Computation of the tyre force, see `arguments.GriddedCrossing`."""
+    """Whether the tyre force is computed from the masses above it (`arguments.GriddedCrossing`)."""
     lead: Lead = NO_LEAD
     """Front axle of a truck with a tandem: then the masses above are not used, and the body has no
     equations."""
@@ -121,9 +123,10 @@ def no_suspension_noise() -> FloatArray:
 
 
 def estimation_matrix(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex128]:
-    """Return the truck's equations as factors of its accelerations: (4, 4, f).
+    """Return the truck's equations as factors (4, 4, f) of its accelerations, at `omega` (f,).
 
-    Rows are s² times the input profiles R_1, R_2 and the body equations; columns s1, s2, u1, u2.
+    Rows are s² times the input profiles R_1, R_2 and s² times the body equations divided by
+    `body_divisors`; columns are the accelerations s1, s2, u1, u2.
     """
     s = 1j * omega
     theta = truck.theta
@@ -182,14 +185,14 @@ def noise_spectrum(
 ) -> NDArray[np.complex128]:
     """Return one-sided spectra of the residuals' noise as accelerations: (3, 3, f).
 
-    `force` (2, shapes) in N²/Hz is the nonlinear force of springs and dampers, of which body
-    equations have `REDUCED_WEIGHT_FACTOR` times the power; `road` is the mismatch.
+    `force` (2, shapes) in N²/Hz are the levels of suspension noise, multiplied by
+    `REDUCED_WEIGHT_FACTOR` for the body equations; `road` is the mismatch, `omega` (f,).
     """
     responses = _responses(truck, omega)
     sources = np.concatenate([density, density[[1, 0, 3, 2]]])[: responses.shape[1]]
     weighted = responses * (sources**2)[None, :, None]
     spectrum = np.asarray(np.einsum("icf,jcf->ijf", weighted, responses.conj()))
-    if truck.lead.ahead_m > 0.0:  # residuals that are zero, of any noise of their own
+    if truck.lead.ahead_m > 0.0:  # residuals that are always zero get some independent noise
         zero = [1, 2] if truck.lead.is_equalised else [1]
         spectrum[zero, zero] += float(density @ density)
     if truck.lead.ahead_m > 0.0 and force.any():
@@ -211,7 +214,7 @@ def noise_spectrum(
 def _body_spectra(
     truck: NoisePath, density: FloatArray, force: FloatArray, omega: FloatArray
 ) -> FloatArray:
-    """Return the spectra of the body equations (2, f) from `_spectrum`."""
+    """Return the spectra (2, f) of the body equations in `noise_spectrum`, without mismatch."""
     return np.asarray(noise_spectrum(truck, density, force, None, omega)[[1, 2], [1, 2]].real)
 
 
@@ -222,7 +225,10 @@ def _suspension_noise_spectra(truck: NoisePath, force: FloatArray, omega: FloatA
 
 
 class AliasedBands(NamedTuple):
-    """Bands up to half the rate of the residuals, and those that alias to them."""
+    """Frequencies up to half the rate of the residuals, and those that alias to them.
+
+    All arrays are (f,): angular frequencies, and the power that the filter passes there.
+    """
 
     below: FloatArray
     above: FloatArray
@@ -231,7 +237,7 @@ class AliasedBands(NamedTuple):
 
 
 def folded(rows: RowFilter, count: int) -> AliasedBands:
-    """Return bands of `count` frequencies."""
+    """Return midpoints of `count` even bands up to half the residuals' rate, and their aliases."""
     half = 0.5 / (rows.every * rows.step_s)
     step = 2.0 * np.pi * half / count
     below = step * (np.arange(count, dtype=np.float64) + 0.5)
@@ -249,7 +255,7 @@ def folded_spectrum(
     force: FloatArray,
     road: Mismatch | None,
 ) -> NDArray[np.complex128]:
-    """Return spectra of the residuals (f, 3, 3), including aliases."""
+    """Return `noise_spectrum` of the filtered residuals (f, 3, 3), including aliases."""
     both = np.concatenate([at.below, at.above])
     power = np.concatenate([at.power_below, at.power_above])
     whole = noise_spectrum(truck, density, force, road, both) * power
@@ -267,8 +273,9 @@ def noise_power(
 ) -> FloatArray:
     """Return tr(C_0^-1 C) per residual sample for other trucks, minus that of the first: (w,).
 
-    `which` (w,) counts from the second truck on; `density` is (trucks, 4), `force` (2, shapes). The
-    spectra are those of an endless record of residuals, aliased at half their rate.
+    `which` (w,) are indices of these trucks, 0 for the second of `trucks`; `density` is (trucks,
+    4), `force` (2, shapes). The spectra are those of an endless record of residuals, aliased at
+    half their rate.
     """
     spectrum = partial(folded_spectrum, folded(rows, _FEW_FREQUENCIES), force=force, road=road)
     first = np.linalg.inv(spectrum(trucks[0], density[0]))

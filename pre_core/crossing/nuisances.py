@@ -2,10 +2,10 @@
 
 The residuals determine the nuisances so exactly that weighted draws of all coordinates would have
 negligible weights; given the bridge, the nuisances are normal. So residuals are evaluated with
-nuisances that follow the bridge, and projected on what no nuisance explains. The nuisances follow
-the bridge linearly, and on demand by one step of Gauss-Newton for each bridge: without it, a bridge
-metres from the optimum's offset would be free to move the truck to where its residuals are not
-linear, and fit better than any other.
+nuisances that follow the bridge, and the part that nuisances explain is projected out. The
+nuisances follow the bridge linearly and, on demand, by a Gauss-Newton step for each bridge. Without
+this step, a bridge metres from the optimum's offset could move the truck to where its residuals are
+not linear, and fit better than any other.
 
 The vibration before the crossing is a wave of the bridge's own frequency, which moves with the
 bridge: removed at the frequency of the optimum it would leave, or take, a wave in the residuals of
@@ -33,9 +33,10 @@ _SWINGING = 40
 _LEAST_WAVE = 0.03
 """Smallest wave that is kept, in standard deviations of a residual."""
 _LEVEL = 10.0
-"""Residual of the expected squares at the optimum: half its square bounds how far they may be above
-their tangent. A far smaller one would be nonlinear where they are below; with a far larger one,
-curvature that matters would be less than the smallest that fusion keeps."""
+"""Residual that stands for the expected squares at the optimum: half its square is the largest
+excess above their tangent that counts. A far smaller residual would be nonlinear where the squares
+are below the tangent; with a far larger one, relevant curvature would be below the least that
+fusion keeps."""
 
 
 class ResidualParts(NamedTuple):
@@ -44,11 +45,11 @@ class ResidualParts(NamedTuple):
     curved: NDArray[np.int64]
     """Indices (n,) in y of the coordinates whose effect is not linear, without the offset."""
     linear: NDArray[np.int64]
-    """Indices (t,) of coordinates that remain and enter linearly."""
+    """Indices (t,) of coordinates that are not integrated out and have linear effects."""
     rows: NDArray[np.int64]
     """Indices (m,) of the residuals, without the priors of `curved` and `linear` coordinates."""
     waves: FloatArray
-    """Effect (m, q) of waves of the mismatch that remain."""
+    """Effects (m, q) of waves of the mismatch that are not integrated out."""
     wave_precision: FloatArray
     """Prior precision (q, q) of their coefficients."""
 
@@ -68,19 +69,20 @@ class Nuisances(NamedTuple):
     """Indices (n + 1,) in y of the curved coordinates and of the offset."""
     own: NDArray[np.int64]
     """Indices (s,) of the nuisances in y."""
-    of_own: FloatArray  # (s, n + 1) their slopes
-    of_linear: FloatArray  # (t, n + 1) slopes of the linear coordinates
+    of_own: FloatArray  # (s, n + 1) derivatives of the nuisances with respect to `kept`
+    of_linear: FloatArray  # (t, n + 1) derivatives of the linear coordinates likewise
     basis: FloatArray
     """Orthonormal columns (m + r + 1, s + r) that span all effects of nuisances and mixture."""
     step: FloatArray
-    """Factors (s, m + r + 1) from residuals to the nuisances' Gauss-Newton step, all else free."""
+    """Factors (s, m + r + 1) from residuals to the nuisances' Gauss-Newton step, in which mixture,
+    linear coordinates and waves are free, too."""
     expected: ExpectedSquares
     evaluations: int
     """Number of evaluations that the nuisances took."""
 
     @property
     def mixture_size(self) -> int:
-        """Number r of waves of the mixture."""
+        """The number r of waves of the mixture."""
         return self.basis.shape[1] - self.own.size
 
 
@@ -140,7 +142,10 @@ def nuisances_of(
 
 
 def with_mixture(columns: FloatArray, size: int) -> FloatArray:
-    """Return columns (m, n) with zeros for `size` priors of the mixture, and expected squares."""
+    """Return columns (m + size + 1, n): `columns` (m, n) and zeros for mixture and squares.
+
+    `size` is the number of priors of the mixture; the last row is that of the expected squares.
+    """
     return np.vstack([columns, np.zeros((size + 1, columns.shape[1]))])
 
 
@@ -221,9 +226,9 @@ def swing_effects(
 def _steps(
     parts: tuple[FloatArray, FloatArray, FloatArray], wave_precision: FloatArray
 ) -> FloatArray:
-    """Return the Gauss-Newton steps (…, m) of all `parts` by the residuals.
+    """Return the factors (…, m) from residuals to the Gauss-Newton steps of all `parts`.
 
-    These are the columns (m, …) of nuisances, linear coordinates and waves.
+    The parts are columns (m, …): effects of nuisances, linear coordinates and waves.
     """
     columns = np.hstack(parts)
     begin = parts[0].shape[1]

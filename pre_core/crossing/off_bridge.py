@@ -19,12 +19,13 @@ from pre_core.physics.simulate import rear_position_m
 FEWEST_ROWS = 24
 """Fewest residuals in one segment that determine the mismatch."""
 _STEP_SAMPLES = 9
+"""Samples before and after an end of the bridge that a compliant bearing affects."""
 MIN_MISMATCH_STATISTIC = 30.0
 """Smallest likelihood-ratio statistic (`whittle`) of the residuals off the bridge."""
 
 
 def levels_at(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
-    """Return the mismatch levels (s,) of the residuals off the bridge at y (size,).
+    """Return the mismatch levels (s,) of the residuals off the bridge at y (f,).
 
     They are zero where too few residuals exist, or where a mismatch explains them no better
     (`MIN_MISMATCH_STATISTIC`).
@@ -34,7 +35,7 @@ def levels_at(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
 
 
 def mismatch_excess(problem: PosteriorProblem, y: FloatArray) -> float:
-    """Return the power of the mismatch off the bridge over that of declared axles, at y (size,).
+    """Return the ratio of the mismatch's power off the bridge to that of declared axles, y (f,).
 
     The ratio refers to waves of ten metres on a surface as rough as the road at y; it is 0 without
     an estimate.
@@ -44,7 +45,7 @@ def mismatch_excess(problem: PosteriorProblem, y: FloatArray) -> float:
 
 
 def surface_level_at(problem: PosteriorProblem, y: FloatArray) -> float:
-    """Return Phi k^3 in m² of the surface off the bridge at y (size,), 0 without an estimate."""
+    """Return Phi k^3 in m² of the surface off the bridge at y (f,), 0 without an estimate."""
     _, _, expected = _levels_off_bridge(problem, y)
     return float(expected[1] / problem.mismatch.shapes.expected_m[1])
 
@@ -75,7 +76,7 @@ def _levels_off_bridge(
 
 
 def rear_axle_samples_m(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
-    """Return the rear axle's chainage at each sample (n,) of the residuals at y (size,)."""
+    """Return the rear axle's chainage at each sample (n,) of the residuals at y (f,)."""
     crossing = problem.crossing
     at = points(problem, y[None, :])
     rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), crossing.direction)
@@ -83,21 +84,21 @@ def rear_axle_samples_m(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
 
 
 def rear_axle_chainage_m(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
-    """Return the rear axle's chainage at the middle of each filtered residual (m,) at y (size,)."""
+    """Return the rear axle's chainage at the middle of each filtered residual (m,) at y (f,)."""
     rows = problem.rows
     middles = rows.taps.size // 2 + rows.every * np.arange(row_count(rows, problem.crossing.rows))
     return rear_axle_samples_m(problem, y)[middles]
 
 
 def compared_length_m(problem: PosteriorProblem, y: FloatArray) -> float:
-    """Return the length of road compared by usable residuals off the bridge, at y (size,)."""
+    """Return the length of road compared by usable residuals off the bridge, at y (f,)."""
     rows = [one.stop - one.start for one in off_bridge_residuals(problem, y)]
     apart_m = problem.rows.every * problem.rows.step_s * problem.mismatch.speed_m_per_s
     return apart_m * sum(one for one in rows if one >= FEWEST_ROWS)
 
 
 def off_bridge_residuals(problem: PosteriorProblem, y: FloatArray) -> tuple[slice, slice]:
-    """Return the slices of filtered residuals before and after the bridge, at y (size,)."""
+    """Return the slices of filtered residuals before and after the bridge, at y (f,)."""
     at = points(problem, y[None, :])
     crossing, rows = problem.crossing, problem.rows
     rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), crossing.direction)

@@ -108,7 +108,7 @@ class _Budget(NamedTuple):
 
 
 def _whole_bridge(problem: PosteriorProblem, strategy: SearchStrategy) -> FloatArray:
-    """Return directions in which all elements change together, without restraint and compliance."""
+    """Return directions (f, d) in which all elements change together, the ends and torsion not."""
     where = layout(problem)
     unit = np.eye(where.size)
     elements = where.elements
@@ -120,9 +120,10 @@ def _whole_bridge(problem: PosteriorProblem, strategy: SearchStrategy) -> FloatA
 
 
 def find_optimum(inputs: CrossingInputs, report: Report = lambda stage, fraction: None) -> Optimum:
-    """Return the optimum of the posterior; NOT_FINITE if no offset gave finite residuals.
+    """Return the optimum of the posterior; a search that fails is a value, too.
 
-    Its `ending` is STEPS_EXHAUSTED if the search took more than `_MAX_EVALUATIONS` without a fit.
+    Its `ending` is NOT_FINITE if no offset gave finite residuals, and STEPS_EXHAUSTED if the search
+    took more than `_MAX_EVALUATIONS` without a fit.
     """
     problem, y = build_problem(inputs)
     latest = found = _run_strategies(problem, y, report, _MAX_EVALUATIONS)
@@ -204,7 +205,7 @@ def _about_truck(
 
 
 def _other_strategies(fit: Optimum) -> tuple[tuple[SearchStrategy, ...], OffBridgeFit]:
-    """Return the strategies to try after the simplest has not ended at a fit, and the truck alone.
+    """Return the strategies to try after the simplest one, and the fit of the truck alone.
 
     Where a linear truck on one profile explains the residuals off the bridge, no other truck is
     tried. A suspension that is not linear resembles mismatch until its weight is reduced.
@@ -229,8 +230,8 @@ def _try_strategies(
 ) -> list[Optimum]:
     """Return the optima of the strategies after the first one, up to the first that is final.
 
-    A line ends them, too, but only where mismatch, which resembles one without, is modelled or not
-    to be tried any more.
+    A line ends them, too, but only if mismatch is modelled or no longer to be tried: unmodelled
+    mismatch resembles a line.
     """
     found: list[Optimum] = []
     has_friction, has_line = first.stopped_by_friction, False
@@ -274,7 +275,7 @@ def _refine_candidates(
     report: Report,
     budget: _Budget,
 ) -> Optimum:
-    """Return the best optimum of a strategy; none, as without finite numbers, if it diverges."""
+    """Return the best optimum of a strategy; the result of `_no_optimum` if it diverges."""
     try:
         return _refine_likeliest(problem, y, strategy, report, budget)
     except (FloatingPointError, np.linalg.LinAlgError):
@@ -290,8 +291,7 @@ def _refine_likeliest(
 ) -> Optimum:
     """Return the best optimum reached from the most likely offsets.
 
-    There is none, as without finite residuals, as soon as a candidate shows that the strategy is
-    wrong.
+    It is the result of `_no_optimum` as soon as a candidate shows that the strategy is wrong.
     """
     force = no_suspension_noise() if strategy.uses_suspension else None
     # With the noise of a front axle ahead of a tandem, offsets metres apart would fit alike.
@@ -330,7 +330,7 @@ def _refine_likeliest(
 
 
 class _FittedCandidates(NamedTuple):
-    """Best optimum of those tried, if any; their number, the evaluations, and clear friction."""
+    """Best optimum of the candidates, if any; number tried, evaluations, and clear friction."""
 
     best: Optimum | None
     tried: int
@@ -395,7 +395,7 @@ def _find_truck(
     report: Report,
     force: FloatArray | None,
 ) -> tuple[PosteriorProblem, FloatArray, int]:
-    """Return the first stage's problem, coordinates and evaluations, the bridge as a whole.
+    """Return problem, y (f,) and evaluations of the first stage, which scales the whole bridge.
 
     Similar profiles (tandem, equal tyres) differ less than a wrong truck makes them differ, so the
     truck is fitted before the mismatch. Otherwise the search would follow a spurious mismatch

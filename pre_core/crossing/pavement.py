@@ -41,12 +41,14 @@ _BLEND_M = 0.5
 _PASSES, _LONGEST_STEP = 40, 0.5
 _CONVERGED = 1e-4
 _KNOT_M = 0.1
+"""Spacing of the splines at an end."""
 _KNOTS = np.arange(-3.0, 4.0)
 """Centres of the cubic splines at an end, in units of their spacing; a step is added to them."""
 _JOINT_SIZE_M = 1e-3
-"""Size of a joint's mismatch; local waves that even with it do not affect the residuals stay."""
+"""Size of a joint's mismatch; local waves that do not affect the residuals at this size are
+kept."""
 _CLEAR_JOINT = 8.0
-"""Excess of local power at the ends above which it is a joint, in standard deviations of chance."""
+"""Smallest excess of local power at the ends that counts as a joint, in its standard deviations."""
 
 
 def estimate_pavement(
@@ -55,7 +57,7 @@ def estimate_pavement(
     level_m3: FloatArray,
     front_axle: FrontAxleResponse | None = None,
 ) -> BridgePavement:
-    """Return the mismatch on the bridge relative to levels (s,) off it, at y (size,).
+    """Return the mismatch on the bridge relative to levels (s,) off it, at y (f,).
 
     The noise from the axle ahead of a tandem has waves as short, and scales with the deck's
     roughness.
@@ -85,7 +87,7 @@ def estimate_pavement(
 def _periodogram(
     problem: PosteriorProblem, y: FloatArray, road: Mismatch, some: NDArray[np.int64]
 ) -> PeriodogramSegment:
-    """Return the periodogram of successive mismatch residuals `some` (m,), as on the road."""
+    """Return the periodogram of successive residuals `some` (m,), with its expectation."""
     rows, omega = problem.rows, problem.rows.omega
     table = _mismatch.unwindowed(road.shapes)
     density = omega**4 * (road.level_m3 @ _mismatch.density_at(road, omega, table))
@@ -98,7 +100,7 @@ def _periodogram(
 
 
 def known_pavement(problem: PosteriorProblem, y: FloatArray, ratio: float) -> BridgePavement:
-    """Return a mismatch on the bridge that is exactly `ratio` times the road's, at y (size,)."""
+    """Return a mismatch on the bridge that is exactly `ratio` times the road's, at y (f,)."""
     share = _share_on_bridge(_distance_inside_m(problem, y))
     return BridgePavement(np.array([np.log(ratio), 0.0]), np.zeros((2, 2)), share)
 
@@ -162,7 +164,7 @@ def parts_of(road: Mismatch, count: int) -> list[RoadPart]:
 
 
 def without_joints(problem: PosteriorProblem, y: FloatArray, noise: Whitener) -> Whitener:
-    """Return the whitener that removes local waves at both ends, if a joint is clear at y (size,).
+    """Return the whitener that removes local waves at both ends, if a joint is clear at y (f,).
 
     The result is the same `noise` without a clear joint.
     """

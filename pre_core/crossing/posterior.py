@@ -42,7 +42,8 @@ _INITIAL_SPREAD = np.array([0.1, 0.1, 0.1])  # m, m/s, m/s²: wide; they are nui
 _SWING_M = 1e-3
 """Scale of the first mode's displacement, and velocity over omega, at its largest point: a 30 t
 lorry that left a tenth of a second ago leaves a bridge of 30 m vibrating by a millimetre. For the
-second it is a quarter, for the third a ninth: a load excites the j-th mode of a beam by 1/j^4."""
+second it is a quarter, for the third a ninth, wider than the 1/j^4 by which a static load excites
+the j-th mode of a beam."""
 _JERK_M_PER_S3 = 1.0
 """Prior RMS jerk of a driver's speed changes."""
 _DEGREE = 5
@@ -58,14 +59,15 @@ class Priors(NamedTuple):
     theta: FloatArray  # (p,) nominal values
     spread: FloatArray  # (p,) relative; absolute where the prior is half-normal
     half_normal: NDArray[np.bool_]  # (p,) at zero; log-normal about the nominal value elsewhere
-    estimated: NDArray[np.bool_]  # (p,) which are unknown at all
+    estimated: NDArray[np.bool_]  # (p,) the others are fixed at their nominal values
     absence: FloatArray
     """Prior probability (p,) that a parameter with a half-normal prior is zero."""
     wheelbase_m: float
-    wheelbase_spread: float
+    wheelbase_spread: float  # relative
     gain_spread: float
     """Standard deviation of each channel's gain, independent of the others'."""
     common_gain_spread: float
+    """Standard deviation of the part of the gains that all channels share."""
     delay_spread_s: float
 
 
@@ -99,6 +101,7 @@ class PosteriorProblem(NamedTuple):
     receiver_values: FloatArray  # (r,)
     noise_slope: FloatArray  # of the first coordinates: see `all_rows`
     works: tuple[Buffers, ...]
+    """Work arrays of each thread; modified by every evaluation."""
     lines_hz: tuple[float, ...] = ()
     """Frequencies in the residuals of the removed lines, see `lines`."""
     line_waves: FloatArray = np.zeros((0, 0))
@@ -106,7 +109,7 @@ class PosteriorProblem(NamedTuple):
     front_axle: MismatchSpectra | None = None
     """Spectra of the profile of the axle ahead of a tandem minus that of the tandem."""
     displaced_leads: tuple[Lead, ...] = ()
-    """Front axles with one value displaced by the standard deviation of its prior."""
+    """Front axles, each with one declared value changed by the standard deviation of its prior."""
 
 
 def has_tandem(problem: PosteriorProblem) -> bool:
@@ -125,9 +128,11 @@ def layout(problem: PosteriorProblem) -> ParameterLayout:
 def trajectory_basis(
     fixes: ChainageFixes, start_s: float, step_s: float, count: int, direction: int, knot_s: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the spline basis at the samples, the receiver's residuals, and their best fit.
+    """Return the trajectory's bases at the samples, the receiver's residuals, and their best fit.
 
-    These are (n, b) positions, (n, b) accelerations, (r, b + 1), (r,) and (b + 1,).
+    The bases (n, b) give position and acceleration of `count` = n samples for b coefficients. The
+    residuals are rows (r, b + 1) times coefficients and offset, minus values (r,): of the fixes and
+    of the priors of jerk and offset. The best fit is (b + 1,).
     """
     time = start_s + step_s * np.arange(count, dtype=np.float64)
     first = min(float(time[0]), float(fixes.time_s[0]))
@@ -135,8 +140,8 @@ def trajectory_basis(
     spans = max(2, round((last - first) / knot_s))
     inner = np.linspace(first, last, spans + 1)
     of = partial(splines.basis, splines.clamped_knots(inner, _DEGREE), _DEGREE)
-    # The third derivative is a parabola between knots: two points of Gauss integrate its square
-    # well enough for a prior.
+    # The third derivative is a parabola between knots: Gauss quadrature at two points integrates
+    # its square well enough for a prior.
     apart = np.diff(inner)
     middles, aside = 0.5 * (inner[1:] + inner[:-1]), apart / np.sqrt(12.0)
     at = np.concatenate([middles - aside, middles + aside])
@@ -182,7 +187,7 @@ class PhysicalValues(NamedTuple):
 
 
 def values_of(problem: PosteriorProblem, y: FloatArray) -> PhysicalValues:
-    """Return truck, bridge and common gain of the points y (k, size)."""
+    """Return truck, bridge and common gain of the points y (k, f)."""
     where = layout(problem)
     priors = problem.priors
     k = y.shape[0]
@@ -202,7 +207,7 @@ def values_of(problem: PosteriorProblem, y: FloatArray) -> PhysicalValues:
 
 
 def points(problem: PosteriorProblem, y: FloatArray) -> EvaluationPoints:
-    """Return the physical points of y (k, size), with the truck's chainage at every sample."""
+    """Return the physical points of y (k, f), with the truck's chainage at every sample."""
     where = layout(problem)
     priors = problem.priors
     values = values_of(problem, y)
@@ -221,7 +226,7 @@ def points(problem: PosteriorProblem, y: FloatArray) -> EvaluationPoints:
 
 
 def data_rows(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
-    """Return whitened residuals (k, 3 m) of the data alone, for y (k, size)."""
+    """Return whitened residuals (k, 3 m) of the data alone, for y (k, f)."""
     out = np.empty((y.shape[0], problem.noise.reciprocal.size))
     evaluate_white(
         problem.crossing, problem.rows, problem.noise, problem.works, points(problem, y), out
@@ -230,7 +235,7 @@ def data_rows(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
 
 
 def filtered_rows(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
-    """Return residuals (3, m) of the data at one point y (size,), filtered and not whitened."""
+    """Return residuals (3, m) of the data at one point y (f,), filtered and not whitened."""
     (residual,) = evaluate(problem.crossing, problem.works, points(problem, y[None, :]))
     out = np.empty((RESIDUALS, row_count(problem.rows, problem.crossing.rows)))
     for kind in range(RESIDUALS):
@@ -239,7 +244,7 @@ def filtered_rows(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
 
 
 def filtered_rear_road(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
-    """Return filtered residuals (m,) of the rear wheel's own profile, at one point y (size,)."""
+    """Return filtered residuals (m,) of the rear wheel's own profile, at one point y (f,)."""
     crossing, rows = problem.crossing, problem.rows
     at = points(problem, y[None, :])
     heights, _ = roads_and_deflections(crossing, problem.works[0], at, 0)
@@ -250,7 +255,7 @@ def filtered_rear_road(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
 
 
 def noise_path_at(problem: PosteriorProblem, y: FloatArray) -> tuple[NoisePath, FloatArray]:
-    """Return the truck's noise path at y (size,), and its sensors' densities (4,) with gains."""
+    """Return the truck's noise path at y (f,), and its sensors' densities (4,) with gains."""
     at = points(problem, y[None, :])
     crossing = problem.crossing
     wheelbase = float(at.wheelbase_m[0])
@@ -266,7 +271,7 @@ def noise_path_at(problem: PosteriorProblem, y: FloatArray) -> tuple[NoisePath, 
 
 
 def suspension_equation_weight(problem: PosteriorProblem, y: FloatArray) -> float:
-    """Return the weight of the body equations, 0 to 1, at y (size,); 0 if equalised."""
+    """Return the weight of the body equations, 0 to 1, at y (f,); 0 if equalised."""
     if has_tandem(problem) and problem.crossing.lead.is_equalised:
         return 0.0
     return _noise.suspension_equation_weight(
@@ -275,7 +280,7 @@ def suspension_equation_weight(problem: PosteriorProblem, y: FloatArray) -> floa
 
 
 def noise_power_ratio(problem: PosteriorProblem, y: FloatArray) -> float:
-    """Return the ratio of sensor noise power to its declared value, for the truck at y (size,)."""
+    """Return the ratio of sensor noise power to its declared value, for the truck at y (f,)."""
     body = filtered_rows(problem, y)[1:]
     return _noise.noise_power_ratio(problem.rows, *noise_path_at(problem, y), body)
 
@@ -309,7 +314,7 @@ def all_rows(problem: PosteriorProblem, y: FloatArray, temperature: float = 1.0)
 
 
 def log_odds_of_absence(problem: PosteriorProblem, inflation: float = 1.0) -> FloatArray:
-    """Return the log ratio (size,) of the point mass at zero to the prior density at zero.
+    """Return the log ratio (f,) of the point mass at zero to the prior density at zero.
 
     The noise is `inflation` times as large and the prior as much wider. The ratio is minus infinity
     for coordinates that cannot be absent.
@@ -329,7 +334,7 @@ def log_odds(absence: FloatArray, inflation: float = 1.0) -> FloatArray:
 
 
 def starting_point(problem: PosteriorProblem, trajectory: FloatArray) -> FloatArray:
-    """Return the coordinates (size,) of the nominal values and of a trajectory (b + 1,)."""
+    """Return the coordinates (f,) of the nominal values and of a trajectory (b + 1,)."""
     where = layout(problem)
     y = np.zeros(where.size)
     y[where.trajectory.start :] = trajectory
@@ -353,7 +358,7 @@ def posterior_covariance(root: FloatArray) -> FloatArray:
 def wheel_profiles(
     problem: PosteriorProblem, y: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return chainage (m,) and profiles (m,) under both wheels there, at one point y (size,).
+    """Return chainage (m,) and profiles (m,) under both wheels there, at one point y (f,).
 
     Chainages are on the bridge only, in the order of the rear wheel's samples. A bias common to all
     sensors bends the whole record into a parabola, which residuals at constant speed do not show:
@@ -397,7 +402,7 @@ def road_noise(
 ) -> FloatArray:
     """Return draws (count, m) in m of the error that sensor noise causes in the mean profile.
 
-    Its chainages are those of `wheel_profiles` for y (size,). White noise of the accelerations
+    Its chainages are those of `wheel_profiles` for y (f,). White noise of the accelerations
     passes the integrals and the input estimation of the truck at y; its effect on the deflection is
     omitted.
     """
@@ -429,7 +434,7 @@ def road_noise(
 
 
 def largest_deflections_m(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
-    """Return the largest deflection under a wheel (k,), positive downwards, for y (k, size).
+    """Return the largest deflection under a wheel (k,), positive downwards, for y (k, f).
 
     Raise FloatingPointError for an impossible point.
     """

@@ -54,7 +54,7 @@ from pre_core.physics.torsion import NO_TORSION, TorsionBasis, torsion_basis
 _KNOT_S = 0.4
 """Knot spacing of the trajectory: a driver changes the speed more slowly."""
 _SLOPE_STEP = 1e-3
-"""Step of the one-sided difference of the noise power over truck and gains."""
+"""Step of the one-sided differences of the noise power with respect to truck and gains."""
 _SWING_BEFORE_S = 0.1
 """Time before the truck's entry at which the initial vibration is defined, a margin for the search.
 """
@@ -79,6 +79,7 @@ class CrossingInputs(NamedTuple):
     fixes: ChainageFixes
     priors: Priors
     parts: int
+    """Number of finite elements in each element of the bridge."""
     threads: int
     footprints: tuple[Footprint, Footprint] = TYPICAL_FOOTPRINTS
     """Footprints of the front and the rear axle."""
@@ -92,13 +93,14 @@ class CrossingInputs(NamedTuple):
     lead_footprint: Footprint = TYPICAL_FOOTPRINTS[0]
     """Footprint of that front axle."""
     displaced_leads: tuple[Lead, ...] = ()
-    """Front axles with one value displaced by the standard deviation of its prior."""
+    """Front axles, each with one declared value changed by the standard deviation of its prior."""
 
 
 def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]:
-    """Return the problem and the coordinates (size,) of its nominal start.
+    """Return the problem and the coordinates (f,) of its nominal start.
 
-    Raise ValueError if torsion is estimated without a speed of its waves.
+    Raise ValueError if torsion is estimated without a speed of its waves, or if the record is
+    shorter than the filters (`channel_signals`).
     """
     model = channel_signals(inputs.acceleration_m_per_s2, inputs.step_s, inputs.slowest_rate_hz)
     n = model.signals.shape[2]
@@ -221,7 +223,9 @@ def update_noise(
     mismatch: FloatArray | None = None,
     pavement: BridgePavement | None = None,
 ) -> PosteriorProblem:
-    """Return the problem with the noise for the truck at y (size,), and bridge coordinates for it.
+    """Return the problem with noise and modal coordinates for truck and bridge at y (f,).
+
+    The work arrays are shared with the given problem, which needs another update after this one.
 
     The suspension noise is `force` (2, shapes), by default that of the body equations at y if it is
     at least `friction_statistic` (`suspension_noise_levels`). Mismatch levels are `mismatch` (s,),
@@ -289,7 +293,7 @@ def _noise_gradient(
 
 
 def _truck_and_gains(problem: PosteriorProblem) -> list[int]:
-    """Return the places in y of the truck, its wheelbase and the gains, which change the noise."""
+    """Return the indices in y of truck, wheelbase and gains, which change the noise."""
     where = layout(problem)
     truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
     return [*range(truck), *range(where.wheelbase, where.gains.stop)]
@@ -298,7 +302,7 @@ def _truck_and_gains(problem: PosteriorProblem) -> list[int]:
 def replace_mismatch(
     problem: PosteriorProblem, y: FloatArray, mismatch: Mismatch | None, runs: float = 1.0
 ) -> PosteriorProblem:
-    """Return the problem with another mismatch, or none, in its noise at y (size,).
+    """Return the problem with another mismatch, or none, in its noise at y (f,).
 
     The noise from the axle ahead of a tandem has `runs` times its power.
     """
@@ -322,7 +326,7 @@ def _with_local_noise(
     front_axle: FrontAxleResponse | None,
     runs: float = 1.0,
 ) -> Whitener:
-    """Return the whitener without lines and joints, and with noise from a tandem's front axle."""
+    """Return the whitener that removes lines and joints, with noise of a tandem's front axle."""
     noise = _without_lines(problem, noise)
     if problem.mismatch.level_m3.any():
         noise = without_joints(problem, y, noise)
@@ -330,7 +334,7 @@ def _with_local_noise(
 
 
 def strongest_line_at_hz(problem: PosteriorProblem, y: FloatArray) -> float:
-    """Return the clearest line's frequency in Hz in the residuals at y (size,), 0 without any."""
+    """Return the clearest line's frequency in Hz in the residuals at y (f,), 0 without any."""
     white = data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)
     if not np.isfinite(white).all():
         return 0.0
@@ -338,7 +342,7 @@ def strongest_line_at_hz(problem: PosteriorProblem, y: FloatArray) -> float:
 
 
 def with_line(problem: PosteriorProblem, y: FloatArray, line_hz: float) -> PosteriorProblem:
-    """Return the problem, before a search from y (size,), with one more line removed."""
+    """Return the problem, before a search from y (f,), with one more line removed."""
     all_hz = (*problem.lines_hz, line_hz)
     count = row_count(problem.rows, problem.crossing.rows)
     line_waves = lines.line_waves(all_hz, count, problem.rows.every * problem.rows.step_s)
@@ -358,7 +362,7 @@ def lines_hz(problem: PosteriorProblem) -> list[float]:
 def with_lines_of(
     problem: PosteriorProblem, y: FloatArray, sensors_hz: Sequence[float]
 ) -> PosteriorProblem:
-    """Return the problem at y (size,) with lines at the sensor frequencies removed."""
+    """Return the problem at y (f,) with lines at the sensor frequencies removed."""
     apart_s = problem.rows.every * problem.rows.step_s
     for hz in sensors_hz:
         problem = with_line(problem, y, lines.folded_hz(hz, apart_s))
@@ -382,7 +386,7 @@ def _without_lines(problem: PosteriorProblem, noise: Whitener) -> Whitener:
 def _displaced_points(
     problem: PosteriorProblem, y: FloatArray, count: int, *, is_inertial: bool
 ) -> tuple[EvaluationPoints, list[NoisePath]]:
-    """Return points and noise paths at y, and a step aside in the first `count` coordinates."""
+    """Return 1 + `count` points and noise paths: at y, and a step along each first coordinate."""
     near = np.repeat(y[None, :], 1 + count, axis=0)
     near[np.arange(1, 1 + count), np.arange(count)] += _SLOPE_STEP
     at = points(problem, near)
@@ -395,7 +399,7 @@ def _displaced_points(
 
 
 def mismatch_gradient(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
-    """Return the part of the gradient at `y` (size,) that the mismatch causes, shape (n,)."""
+    """Return the part of the gradient at `y` (f,) that the mismatch causes, shape (n,)."""
     where, crossing = layout(problem), problem.crossing
     is_inertial = bool(problem.force.any())
     at, trucks = _displaced_points(problem, y, where.delays.stop, is_inertial=is_inertial)

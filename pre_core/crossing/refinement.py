@@ -53,7 +53,7 @@ def refined(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> t
 def about_truck(
     found: Optimum, y: FloatArray, strategy: SearchStrategy, max_evaluations: int
 ) -> tuple[Optimum | None, int]:
-    """Return the best optimum of bridges about a truck at y (size,), and the evaluations.
+    """Return the best optimum of bridges about a truck at y (f,), and the evaluations.
 
     The truck explains the residuals off the bridge, where no bridge acts, so a misfit of `found`
     may be due to a bridge that vibrates at another frequency. Bridges of other frequencies are
@@ -158,10 +158,10 @@ def _fitted(
 
 
 def _is_sharp(found: Optimum) -> bool:
-    """Return whether bridges of other frequencies are tried: equal tyres, and nearly a fit.
+    """Return whether bridges of other frequencies are tried: tyres of one kind, and nearly a fit.
 
-    Of a tandem the whole reach of the receiver was scanned; four searches found no other bridge, by
-    40 % more evaluations.
+    They are not tried for a tandem, whose offsets have been scanned over the whole error of the
+    receiver: four such searches found no other bridge with 40 % more evaluations.
     """
     mismatch = found.problem.mismatch
     is_sharp = mismatch.level_m3.any() and has_alike_tyres(mismatch)

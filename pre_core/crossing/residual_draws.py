@@ -1,4 +1,4 @@
-"""Posterior draws by the residuals themselves, proposed by surfaces of them.
+"""Posterior draws that are proposed by surfaces of the residuals and weighted by the residuals.
 
 With tyres of one kind the posterior is so narrow that a surface fitted once is off by more than its
 width. So draws on a surface (`search.tempering`) are weighted by the residuals there, to which the
@@ -30,13 +30,16 @@ from pre_core.search.latent import latent_coordinates
 from pre_core.search.loop import Report
 
 _MAX_ROUNDS = 12
+"""Largest number of rounds, each of which fits a surface and draws on it."""
 _TOGETHER = 100
 """Number of points evaluated together: their residuals take some megabytes."""
 _STEEPEST = 30.0
-"""Largest logarithm of a point's weight in a fit, relative to the first points' largest."""
+"""Largest absolute logarithm of a point's weight in a fit; the likeliest first point has weight
+1."""
 _IMPOSSIBLE = 1e6
 """Residual of a point that is not possible."""
 _LEAST_SIZE = 1e-9
+"""Smallest spread of a coordinate, which replaces zero."""
 _MOVES = (90,)
 """Number of moves of every draw on a surface."""
 _START_SPREAD = 2.0
@@ -90,7 +93,7 @@ class _Fitted(NamedTuple):
 
 
 class _Points(NamedTuple):
-    """Points at which residuals have been evaluated, and what remains of these."""
+    """Points at which residuals have been evaluated, and sums of these for fits."""
 
     y: FloatArray  # (k, d)
     squares: FloatArray  # (k,) by which draws are weighted
@@ -114,7 +117,7 @@ def residual_draws(
     """
     residuals = _residuals(density, first)
     level = float(log_density(density, first, np.sum(residuals**2, axis=0)).max())
-    # A size of zero is that of what the site file excludes.
+    # A parameter that the site file excludes has the size zero.
     frame = _Frame(first.mean(axis=0), np.maximum(first.std(axis=0), _LEAST_SIZE), level)
     batches, used = [_evaluated(density, frame, first, residuals)], list[_Fitted]()
     while True:
@@ -160,7 +163,7 @@ def prior_centres(found: Optimum, coordinates: NDArray[np.int64]) -> FloatArray:
 
 
 def prior_squares(centres: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the squares (k,) of the priors at points y (k, n + 1), the offset without any."""
+    """Return the squares (k,) of the priors at points y (k, n + 1); the offset has no prior."""
     return np.asarray(np.sum((y[:, :-1] - centres) ** 2, axis=1))
 
 

@@ -76,7 +76,7 @@ def _wheels(
     gravity: float,
     speeding: FloatArray,
 ) -> None:
-    """Compute `road` (minus the profile), `load`, `body`; `gravity` is divided by common gain."""
+    """Compute `road` (minus the profile), `load` and `body`; `gravity` is 1/common gain."""
     m_s = crossing.total_mass_kg - theta[M_U1] - theta[M_U1 + 1]
     m_11, m_22, m_12 = masses_above_axles(m_s, theta[D_1], wheelbase, theta[KAPPA])
     on_axles = masses_on_axles(m_s, theta[D_1], wheelbase, theta[M_U1], theta[M_U1 + 1])
@@ -168,8 +168,8 @@ def _locate_front_sample(
         x1, x2 = sign * front[j], sign * front[j + 1]
         if not (x1 <= wanted <= x2) or x2 <= x1:
             return False
-        # Inverse of the parabola through the samples around, to first order in its curvature, which
-        # is a few thousandths of its slope; what is left out is a millionth of a sample.
+        # Inverse of the parabola through the four samples around, to first order in its curvature,
+        # which is a few thousandths of its slope; the neglected terms are a millionth of a sample.
         slope = 1.0 / (x2 - x1)
         f = (wanted - x1) * slope
         curvature = 0.5 * (sign * (front[j + 2] + front[j - 1]) - x1 - x2) * slope
@@ -209,7 +209,7 @@ def _read(
 
 @inner
 def _compare(crossing: GriddedCrossing, work: Buffers, out: FloatArray) -> None:
-    """Compute all residuals to `out` (3, rows), at the times of `_locate_front_sample`."""
+    """Write all residuals to `out` (3, rows), at the times of `_locate_front_sample`."""
     road, body = work.road, work.body
     first = np.uintp(crossing.first_row)
     for row in range(np.uintp(crossing.rows)):
@@ -231,10 +231,10 @@ def _evaluate(
     what: int,
     out: FloatArray,
 ) -> None:
-    """Compute the requested output of points `part` to their rows of `out`; NaN if impossible.
+    """Write the output `what` of the points from `part[0]` to `part[1]` to `out`; else NaN.
 
-    One kernel serves all three: each of three would contain a copy of the model, and take as long
-    to load.
+    One kernel serves all three outputs: three kernels would each contain a copy of the model and
+    take as long to load.
     """
     rows, noise = filters
     for k in range(part[0], part[1]):
@@ -322,7 +322,10 @@ def evaluate_white(
     points: EvaluationPoints,
     out: FloatArray,
 ) -> None:
-    """Compute whitened residuals of points to columns of `out` (k, 3 m or more); NaN as above."""
+    """Write whitened residuals to the first 3 m columns of `out` (k, 3 m or more).
+
+    Impossible points are NaN, as in `evaluate`.
+    """
 
     def part(work: Buffers, begin: int, stop: int) -> None:
         _evaluate(crossing, (rows, noise), work, points, (begin, stop), _WHITE, out)
@@ -369,7 +372,7 @@ def roads_and_deflections(
 def largest_deflections(
     crossing: GriddedCrossing, works: tuple[Buffers, ...], points: EvaluationPoints
 ) -> FloatArray:
-    """Return the largest deflection (k,) in m under a wheel, positive downwards; NaN as above."""
+    """Return the largest deflection (k,) in m under a wheel, down positive; NaN if impossible."""
     out = np.empty(points.theta.shape[0])
 
     def part(work: Buffers, begin: int, stop: int) -> None:
@@ -383,7 +386,7 @@ def largest_deflections(
 def _deflections(
     crossing: GriddedCrossing, work: Buffers, points: EvaluationPoints, k: int
 ) -> FloatArray:
-    """Return the deflections of point k (2, n), `work.road` its negated profiles; or NaN."""
+    """Return deflections (2, n) of point k, up positive, or NaN; leave -profiles in `work.road`."""
     one = EvaluationPoints(*(of[k : k + 1] for of in points))
     out = np.empty((1, work.road.size))
     _evaluate(crossing, _NO_FILTERS, work, one, (0, 1), _DEFLECTIONS, out)

@@ -2,8 +2,8 @@
 
 The whitened residuals are fitted by parabolas over points drawn from a widened posterior (Box and
 Wilson 1951). The elements enter as ln c, in which the parabolas hold over a wider range than in c.
-Differences at the optimum alone miss what a bridge with restrained ends does to a crossing whose
-own optimum has none. All other coordinates are integrated out (`nuisances`).
+Differences at the optimum alone miss the effect of restrained ends on a crossing whose own optimum
+has none. All other coordinates are integrated out (`nuisances`).
 """
 
 from collections.abc import Callable
@@ -84,12 +84,12 @@ def response_surface(
     """Return the surface of a crossing fitted at points of its curved coordinates and offset.
 
     `jacobian` (rows, f) is that of its residuals at the optimum, in the coordinates y. `drawn`
-    (k, n + 1) are the points, whose nuisances may have a step of their own.
+    (k, n + 1) are the points. With `has_step` the nuisances of each point take a Gauss-Newton step.
     """
     parts, r = of.parts, of.mixture_size
     linear = unexplained(of, with_mixture(jacobian[np.ix_(parts.rows, parts.linear)], r))
     waves = unexplained(of, with_mixture(parts.waves, r))
-    # Zero is what the site file excludes.
+    # A parameter that the site file excludes has the size zero.
     centre, size = drawn.mean(axis=0), np.maximum(drawn.std(axis=0), _LEAST_SIZE)
     fitted, error = _fit_parabolas(
         (drawn - centre) / size,
@@ -177,10 +177,10 @@ def _fit_parabolas(
 
 
 def _root_of_squares(columns: FloatArray, error: FloatArray) -> FloatArray:
-    """Return few rows (q, q) with the products of `columns` (m, q), less what is error in them.
+    """Return R (q, q) with R'R = A'A minus the `error` (p, p) of its first columns; A is (m, q).
 
-    The residuals' squares are all that counts. Those of fitted coefficients are too large by their
-    `error` (p, p), which would count as knowledge of the bridge, in every crossing again.
+    Only the squares of the residuals matter, so R replaces A = `columns`. Without the subtraction,
+    the error of fitted coefficients would count as information on the bridge, in every crossing.
     """
     squares = columns.T @ columns
     squares[: error.shape[0], : error.shape[0]] -= error

@@ -24,15 +24,15 @@ _TABLE = 1024  # frequencies of the numerical integral over the noise spectrum
 
 
 class RowFilter(NamedTuple):
-    """Low-pass, decimation and second difference in one: output k begins at sample k `every`."""
+    """Low-pass, decimation and second difference in one: output k begins at sample k * `every`."""
 
     taps: FloatArray
     every: int
     step_s: float
     """Step of the samples before the filter."""
-    omega: FloatArray  # (f,) middles of even intervals of angular frequency, up to where it stops
+    omega: FloatArray  # (f,) midpoints of even intervals of angular frequency, to the stop band
     power: FloatArray  # (f,) from white noise of an acceleration to the rows, times the interval
-    turn: NDArray[np.complex128]  # (f, lags) phase that a wave gains from row to row
+    turn: NDArray[np.complex128]  # (f, lags) phase factors at each lag between residuals
 
 
 def row_filter(step_s: float) -> RowFilter:

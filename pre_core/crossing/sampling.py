@@ -41,7 +41,7 @@ _MAX_RUNS = 14
 _PATIENCE = 10
 """Number of batches after which draws of a normal likelihood go on only if they are on course."""
 _LEAST_ESS = 30.0
-"""Effective number of draws below which their quantiles say nothing."""
+"""Effective number of draws below which their quantiles are meaningless."""
 _NEGLIGIBLE_ODDS = 0.02
 """Odds below which torsion is omitted from the draws: it changes no interval and costs draws."""
 
@@ -74,8 +74,8 @@ def sample(
 ) -> PosteriorDraws:
     """Draw from the posterior about its optimum, for noise `inflation` times the declared one.
 
-    Return at least `draws` in all chains together; it ends with STEPS_EXHAUSTED if not converged.
-    Improbable torsion is zero in all draws.
+    Return at least `draws` in all chains together; their `ending` is STEPS_EXHAUSTED if they have
+    not converged. Improbable torsion is zero in all draws.
     """
     if found.problem.mismatch.level_m3.any():
         return _mismatch_draws(found, draws, seed, inflation, report)
@@ -171,10 +171,10 @@ def _resample_to_chains(
 def _mismatch_draws(
     found: Optimum, draws: int, seed: int, inflation: float, report: Report
 ) -> PosteriorDraws:
-    """Return draws with mismatch: by the residuals for tyres of one kind, else by their surface.
+    """Return draws with mismatch, weighted by the residuals or by a surface of these.
 
-    With tyres of one kind the posterior is so narrow that no surface is exact enough. Where
-    weighted draws do not suffice they are replaced by those of `compliances`, linear in c.
+    With tyres of one kind the posterior is so narrow that no surface is exact enough. Weighted
+    draws on a surface that do not suffice are replaced by draws of the normal in c (`compliances`).
     """
     if has_alike_tyres(found.problem.mismatch):
         return _alike_tyres_draws(found, draws, seed, inflation, report)
@@ -192,8 +192,8 @@ def _alike_tyres_draws(
 ) -> PosteriorDraws:
     """Return draws weighted by the residuals, even if these have not converged.
 
-    Draws linear in c, used only if few weighted ones are effective, had errors of six standard
-    deviations in such cases.
+    Draws of the normal in c, which can be wrong by six standard deviations here, replace them only
+    if hardly any are effective.
     """
     weighted, evaluations, points = drawn_by_residuals(found, draws, seed, inflation, report)
     if weighted.worth.ess < _LEAST_ESS:
@@ -223,7 +223,7 @@ def _completed_to_chains(
 
 
 def _compliance_draws(found: Optimum, draws: int, seed: int, inflation: float) -> PosteriorDraws:
-    """Return draws of the normal about the optimum, linear in c, with the exact priors."""
+    """Return draws of the normal in c about the optimum, times the exact priors."""
     near = compliances.compliance_posterior(found, inflation)
     monitored = _monitored_indices(found.problem)
     kept: list[FloatArray] = []

@@ -23,8 +23,8 @@ _FEWEST_PARTS = 3
 def coherence(problem: PosteriorProblem, y: FloatArray) -> float:
     """Return the real part of the coherence of both body equations' residuals, at the same time.
 
-    It is that of the fit y (size,), of accelerations from 3 to 12 Hz. Zero for a record too
-    short for it.
+    The residuals are those of the fit y (f,), as accelerations from 3 to 12 Hz. The result is zero
+    for a record that is too short.
     """
     crossing, rows = problem.crossing, problem.rows
     body = filtered_rows(problem, y)[1:]

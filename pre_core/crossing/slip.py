@@ -27,8 +27,8 @@ from pre_core.search.levenberg_marquardt import LMState
 
 DELAY, GAIN = range(2)
 _MOMENTS = ((24, 0.0), (10, 0.15))
-"""Number of evenly spaced times at which delay and gain of every channel may change, and the share
-of the record at either end without any."""
+"""For delay and gain of every channel: number of evenly spaced times at which it may change, and
+share of the record at either end that has no such times."""
 _STEP = 1e-4
 """Step of the difference in s, and relative for the gain: the residuals are linear in it."""
 _LEAST_SHARE = 1e-3
@@ -55,8 +55,8 @@ def largest_step(problem: PosteriorProblem, state: LMState, covariance: FloatArr
     crossing = problem.crossing
     m = problem.noise.reciprocal.size
     white, jacobian = state.residual[:m], state.jacobian[:m]
-    # Where roads differ the rows answer to noise that is in the signals too: what that makes of the
-    # fit's own columns on average (`noise_slope`) it makes of g as far as these explain it.
+    # With mismatch the residuals also respond to noise in the signals. Its mean effect on the fit's
+    # gradient is `noise_slope`; g has the same effect, as far as the fit's columns explain g.
     gradient = state.jacobian.T @ state.residual
     gradient[: problem.noise_slope.size] += problem.noise_slope
     slope = covariance @ gradient

@@ -28,7 +28,7 @@ def clamped_knots(inner: FloatArray, degree: int) -> FloatArray:
 
 
 def basis(knots: FloatArray, degree: int, x: FloatArray, derivative: int = 0) -> FloatArray:
-    """Return the values (n, b) at x (n,) of each basis function, or of its derivative."""
+    """Return the values (n, b) at x (n,) of each basis function or of a `derivative` of it."""
     if derivative > 0:
         inner = knots[1:-1]
         lower = basis(inner, degree - 1, x, derivative - 1)
@@ -56,7 +56,7 @@ def _not_zero(knots: FloatArray, degree: int, x: FloatArray) -> tuple[IntArray, 
     values = np.zeros((degree + 1, x.size))
     values[-1] = 1.0
     for k in range(1, degree + 1):
-        # The nonzero ones of degree k - 1 are the last k.
+        # The nonzero functions of degree k - 1 are the last k.
         carried = np.zeros(x.size)
         for i in range(k):
             of = degree - k + 1 + i
@@ -68,7 +68,7 @@ def _not_zero(knots: FloatArray, degree: int, x: FloatArray) -> tuple[IntArray, 
 
 
 def value_at(spline: Spline, x: FloatArray, derivative: int = 0) -> FloatArray:
-    """Return the values (n,) of a curve or of its derivative at x (n,)."""
+    """Return the values (n,) at x (n,) of one curve or of a `derivative` of it."""
     return np.asarray(basis(spline.knots, spline.degree, x, derivative) @ spline.coefficients)
 
 

@@ -15,11 +15,11 @@ STEP_REACH = 8
 
 
 def step_table() -> FloatArray:
-    """Return steps within the model's band, (phases + 1, 2 reach), between two samples.
+    """Return band-limited unit steps at all phases between two samples: (phases + 1, 2 reach).
 
-    Row p is the step at p/phases of a sample before sample `reach`, the integral of the sinc of
-    `sinc_table`: when a wheel enters on a compliant bearing, its force and the deflection begin at
-    once.
+    Row p has a step that occurs p/phases of a sample before sample `reach`: the integral of the
+    sinc of `sinc_table`. The force of a wheel that enters on a compliant bearing, and the
+    deflection that it follows, begin with such a step.
     """
     fine = np.arange(2 * STEP_REACH * PHASES + 1) / PHASES - STEP_REACH
     impulse = windowed_sinc(fine, *_sinc_design(STEP_REACH), pedestal=1.0)

@@ -2,10 +2,10 @@
 
 Elements, supports and offset are determined so poorly that their posterior is neither normal nor
 near the optimum. Truck and trajectory follow them (`nuisances`) and are integrated out. The
-remaining few are drawn with weights: by the residuals where both axles have tyres of one kind,
-otherwise from a surface of the residuals (`response_surface`). That surface is fitted twice: at
-points of the normal about the optimum, linear in c (`compliances`), and at points of the posterior
-on that first surface, both widened.
+remaining few are drawn and weighted: by the residuals where both axles have tyres of one kind,
+otherwise by a surface of the residuals (`response_surface`). That surface is fitted twice: at
+points of the normal in c about the optimum (`compliances`), and at points of the posterior on that
+first surface, both widened.
 """
 
 from collections.abc import Callable
@@ -60,8 +60,9 @@ seldom outside, and is where many crossings are linearised in fusion."""
 _WIDER = 1.2
 """The same for the first points of draws by the residuals."""
 _NEGLIGIBLE = 4.0
-"""Log posterior below the optimum's from which another bridge has no share of the first points: its
-density is a fiftieth, which shifts no interval of 95 %, and draws of both converge slowly."""
+"""Log of the ratio of posterior densities beyond which no first points are drawn about a less
+likely bridge: with a fiftieth of the density it shifts no 95 % interval, and draws of both converge
+slowly."""
 _FIRST_POINTS = 320
 """Number of points of the first surface, which only locates the points of the second."""
 
@@ -72,7 +73,8 @@ class ResidualDraws(NamedTuple):
     weighted: WeightedDraws  # of the curved coordinates and the offset, (k, n + 1)
     evaluations: int
     points: FloatArray | None
-    """Points (k, n + 1) of a surface for fusion, about all likely bridges; None if there is one."""
+    """Points (k, n + 1) for a surface in fusion, about all likely bridges; None for a single
+    one."""
 
 
 class SurfacePosterior(NamedTuple):
@@ -106,7 +108,7 @@ def nuisances_on(found: Optimum, points: FloatArray) -> Nuisances:
 def drawn_by_residuals(
     found: Optimum, draws: int, seed: int, inflation: float, report: Report
 ) -> ResidualDraws:
-    """Return draws by the residuals themselves, also about rivals of the optimum."""
+    """Return draws weighted by the residuals, about the optimum and its rivals."""
     nuisances = nuisances_at_optimum(found, inflation, seed)
     curved = curved_coordinates(found)
     half_normal = np.searchsorted(curved, posterior.layout(found.problem).half_normal)
@@ -130,7 +132,7 @@ def drawn_by_residuals(
 def _likely_rivals(
     found: Optimum, nuisances: Nuisances, density: DrawnDensity
 ) -> tuple[list[Optimum], int]:
-    """Return the rivals of an optimum that are not negligible, as optima; and evaluations.
+    """Return the rivals of an optimum that are not negligible, as optima, and count evaluations.
 
     Their nuisances follow them, as in the posterior that is drawn.
     """
@@ -184,13 +186,13 @@ def surface_posterior(found: Optimum, inflation: float, seed: int) -> SurfacePos
 
 
 def _points_of_normal(found: Optimum, count: int, inflation: float, seed: int) -> FloatArray:
-    """Return points (count, n + 1) of the normal about the optimum, linear in c."""
+    """Return at least `count` points (k, n + 1) of the normal in c about the optimum."""
     kept = np.append(curved_coordinates(found), place_of_offset(found.problem))
     return compliances.present_points(found, count, inflation, seed)[:, kept]
 
 
 def _points_about_all(optima: list[Optimum], count: int, inflation: float, seed: int) -> FloatArray:
-    """Return points (k, n + 1) of normals about optima, `count` at least, half about the first."""
+    """Return at least `count` points (k, n + 1) of normals about optima, half about the first."""
     if len(optima) == 1:
         return _points_of_normal(optima[0], count, inflation, seed)
     each = -(-count // (2 * len(optima) - 2))
@@ -241,7 +243,7 @@ def complete(
     inflation: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Return y (k, f) with all else drawn given the curved coordinates and offset (k, n + 1)."""
+    """Return y (k, f): curved coordinates and offset `drawn` (k, n + 1), all others drawn here."""
     y, jacobian = found.state.y, found.state.jacobian
     kept = np.append(curved_coordinates(found), place_of_offset(found.problem))
     others = np.setdiff1d(np.arange(y.size), kept)

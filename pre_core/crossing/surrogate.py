@@ -8,9 +8,9 @@ of it have been weighted by the posterior, a quadratic regression of the log wei
 reshapes the normal likelihood (cf. Opper and Archambeau 2009), so that the weights of the next
 draws vary less.
 
-Over its own draws such a regression minimises KL(surrogate || posterior), which neglects what they
-seldom reach: a few draws keep large weights. Later regressions count draws by a power of their
-weights, most of the way to KL(posterior || surrogate).
+Over draws of the surrogate such a regression minimises KL(surrogate || posterior), which neglects
+regions that these seldom reach: a few draws keep large weights. Later regressions count draws by a
+power of their weights, most of the way to KL(posterior || surrogate).
 """
 
 from itertools import product
@@ -34,8 +34,8 @@ _BATCHES_SEEN, _BATCHES_SEEN_WEIGHTED = 3, 6
 _WEIGHT_POWER = 0.7
 """Power of the weights by which draws count in a weighted regression."""
 _LARGEST_COUNTED = 4.0
-"""Log weight, above the median of the latest draws, up to which it counts: one draw alone must not
-decide."""
+"""Largest log weight that counts, relative to the median of the latest draws: one draw alone must
+not decide."""
 _NUISANCES = 3
 """Number of principal directions of the other coordinates whose curvature is regressed, too."""
 _SHRINKAGE = (1e1, 1e2, 1e3, 1e4, 1e5)
@@ -43,7 +43,7 @@ _SHRINKAGE = (1e1, 1e2, 1e3, 1e4, 1e5)
 _ROUNDING = 1e-12
 """Least share of the log weights' variance that counts as unexplained: a zero has no logarithm."""
 _FLATTEST, _STEEPEST = 0.4, 6.0
-"""Range of the curvature after one refinement, relative to the one before."""
+"""Limits of the ratio of curvatures after and before one refinement."""
 
 
 class SurrogateCoordinates(NamedTuple):
@@ -248,7 +248,7 @@ def _regress(
 
 
 def _limit_change(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Return the precision `after` (f, f) with its ratio to the one `before` limited."""
+    """Return the precision `after` (f, f) with its ratio to the precision `before` limited."""
     root = np.linalg.cholesky(before)
     inverse = np.linalg.inv(root)
     ratio, vectors = np.linalg.eigh(inverse @ after @ inverse.T)

@@ -1,4 +1,4 @@
-"""Spectra of suspension noise, from friction and nonlinear dampers, by basis functions."""
+"""Spectra of suspension noise, which friction and nonlinear dampers cause, as basis functions."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ known. (Friction of 2 to 10 %: EI 0.4 standard deviations too low.) With full we
 the stiffness: the sensor noise is known."""
 REDUCED_WEIGHT_FACTOR = 100.0
 """Factor of the suspension noise where the equations' weight is reduced. Friction is not noise: it
-follows the truck's motion, and could pass for a heavier end or another centre of gravity. Without
+follows the truck's motion, and could pass for a heavier axle or another centre of gravity. Without
 the factor EI was 0.34 standard deviations too low (the median of 36 crossings with friction) and
 the coverage 93 %; with it 0.09 and 97 %, with intervals of the same width."""
 _FORCE_CENTRES_HZ = np.arange(0.0, 60.0, 4.0)

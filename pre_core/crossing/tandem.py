@@ -73,9 +73,10 @@ def wheels(
     """Compute minus the profile (`road`) and `load` of the tandem, and the front axle's `load`.
 
     They are for theta (p,) and longitudinal accelerations `speeding` (n,) of the truck. `body` is
-    zero, except for the second row of a tandem with springs of its own: the moment about the front
-    axle that the springs do not carry, divided by its lever. The front spring's lower end is not
-    measured. `gravity` is divided by the common gain.
+    zero, except for the second row if the tandem's axles have their own springs: the moment about
+    the front axle that the springs' law does not explain, divided by `lever_m` and
+    `REDUCED_WEIGHT_SPRING_N_PER_M`. (The front axle has no such equation, because its own motion is
+    not measured.) `gravity` is 1/common gain.
     """
     lead = crossing.lead
     on = shared_load(lead, theta, crossing.total_mass_kg, gap)
@@ -120,7 +121,7 @@ def _shared_force(
     transfer: float,
     speeding: FloatArray,
 ) -> None:
-    """Compute the equalised spring force in shares to `sharp`, minus the front one to `load`."""
+    """Write the axles' shares of the spring force to `sharp`, minus the front one to `load`."""
     on = shared_load(crossing.lead, theta, crossing.total_mass_kg, gap)
     a_1, a_2 = work.corrected[0, 2], work.corrected[1, 2]
     of_lead, first, second = work.load[2], work.sharp[0], work.sharp[1]
@@ -143,7 +144,7 @@ def _own_forces(
     transfer: float,
     speeding: FloatArray,
 ) -> None:
-    """Compute the forces of springs of their own to `sharp`, minus the front one to `load`."""
+    """Write the forces of both axles' own springs to `sharp`, minus the front one to `load`."""
     on = shared_load(crossing.lead, theta, crossing.total_mass_kg, gap)
     own = own_springs(crossing.lead, gap)
     at_1 = own.lever_1_m / crossing.lead.readings_apart_m

@@ -7,9 +7,10 @@ from pre_core.physics.tandem import shared_load
 
 
 def tandem_friction(problem: PosteriorProblem, y: FloatArray) -> float:
-    """Return the rms friction of a tandem's springs over their static load, at y (size,).
+    """Return the RMS friction of a tandem's springs divided by their static load, at y (f,).
 
-    Zero for a truck without a tandem, and for an equalised one, whose friction does not matter.
+    It is zero for a truck without a tandem, and for an equalised one, whose friction does not
+    matter.
     """
     crossing = problem.crossing
     if not has_tandem(problem) or crossing.lead.is_equalised:

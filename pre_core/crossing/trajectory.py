@@ -18,11 +18,11 @@ from pre_core.physics.simulate import Motion
 
 _KNOT_SPACING_S = 0.5
 _JERK_M_PER_S3 = 0.3
-"""Scale of the jerk of a steadily driven truck, in m/s^3 over one second."""
+"""Scale s_j of the jerk of a steadily driven truck: root of its square integrated over a second."""
 
 
 class Trajectory(NamedTuple):
-    """A fitted curve; `standardised_rms` is that of the fixes' residuals over their noise."""
+    """A fitted curve; `standardised_rms` is the RMS of the fixes' residuals over their noise."""
 
     spline: Spline
     standardised_rms: float
@@ -88,7 +88,10 @@ def motion_at(trajectory: Trajectory, time_s: FloatArray, direction: int) -> Mot
 def arrival_time_s(
     trajectory: Trajectory, position_m: float, direction: int, start_s: float, stop_s: float
 ) -> float:
-    """Return the first time at which the front axle reaches a chainage; NaN if it does not."""
+    """Return the first time from `start_s` to `stop_s` at which the front axle reaches a chainage.
+
+    NaN if it does not.
+    """
     t = np.linspace(start_s, stop_s, max(2, round((stop_s - start_s) / 0.01) + 1))
     beyond = direction * (value_at(trajectory.spline, t) - position_m) >= 0.0
     first = int(np.argmax(beyond))

@@ -34,32 +34,34 @@ _WALK_STEPS = 6
 _WALK_MIN_IMPROVEMENT = 0.5
 """Improvement of the sum of squares that ends the fit of an offset."""
 _STRIDE_M = 0.6
-"""Distance of scanned offsets."""
+"""Distance between scanned offsets."""
 _REFINED_M = (0.3, 0.15)
-"""Refinements about the best one."""
+"""Distances of further offsets to either side of the best one, one after the other."""
 _NEIGHBOUR_M, _NEIGHBOURS = 0.1, 6
 """Distance and number of offsets tried on either side of an optimum with mismatch: a compliant
 bearing makes minima 0.2 m apart, which the truck of the scan does not distinguish."""
 _FAR_STRIDE_M = 1.2
-"""Distance of offsets tried farther away: minima metres apart are as wide."""
-_PATIENCE = 1.5  # strides beyond the best place, except for a tandem
-_REACH = 3.0  # of the offset's spread
+"""Distance between offsets tried farther away: minima metres apart are as wide."""
+_PATIENCE = 1.5  # strides beyond the best offset after which the scan ends, except for a tandem
+_REACH = 3.0  # largest offset in standard deviations of its prior
 _MAX_STRIDES = 60
 """Limit of strides to either side, however uncertain the offset."""
 
 
 class Placement(NamedTuple):
-    """Fit of the bridge with a longitudinal offset `shift_m`, and its parameters there."""
+    """Fit of the bridge with a longitudinal offset `shift_m`."""
 
     objective: float
     shift_m: float
     bridge: FloatArray
+    """Changes (b,) of the bridge's coordinates."""
     places: NDArray[np.int64]
     """Indices in y of the bridge's parameters."""
 
 
 LocalFit = Callable[[float, FloatArray], tuple[Placement, int]]
-"""Function that returns the candidate at a shift in m from a start, and its evaluations."""
+"""Function from a shift in m and initial changes (b,) of the bridge to a candidate and the number
+of evaluations."""
 
 
 def others_effects(
@@ -75,7 +77,7 @@ def others_effects(
 
 
 def _local_fit(problem: PosteriorProblem, y: FloatArray, strategy: SearchStrategy) -> LocalFit:
-    """Return a fit of the bridge alone at an offset, everything else to first order about y."""
+    """Return the fit of the bridge alone at an offset, all else to first order about y (f,)."""
     where = layout(problem)
     places = where.bridge
     free = np.eye(y.size)
@@ -104,7 +106,7 @@ def _local_fit(problem: PosteriorProblem, y: FloatArray, strategy: SearchStrateg
 def scan_offsets(
     problem: PosteriorProblem, y: FloatArray, strategy: SearchStrategy
 ) -> tuple[list[Placement], int]:
-    """Return candidates along the road about y (size,), best first, and the evaluations.
+    """Return candidates along the road about y (f,), best first, and the evaluations.
 
     The fit improves towards the right offset from afar, so the scan ends soon after the best one.
     The axles of a tandem are too close together for that: other minima metres away fit well enough
@@ -164,7 +166,7 @@ def better_neighbour(found: Optimum, strategy: SearchStrategy) -> tuple[Placemen
 def _other_offsets_m(problem: PosteriorProblem) -> list[float]:
     """Return offsets near an optimum, and others as far as the receiver allows.
 
-    Of a tandem these have been scanned already.
+    For a tandem the others have been scanned already.
     """
     near = [_NEIGHBOUR_M * number for number in range(1, _NEIGHBOURS + 1)]
     strides = 0 if has_tandem(problem) else int(_reach_m(problem) / _FAR_STRIDE_M)
@@ -178,7 +180,7 @@ def _reach_m(problem: PosteriorProblem) -> float:
 
 
 def shifted_to(problem: PosteriorProblem, y: FloatArray, place: Placement) -> FloatArray:
-    """Return y (size,) with the bridge at a candidate's offset."""
+    """Return y (f,) with the bridge at a candidate's offset."""
     moved = y.copy()
     moved[layout(problem).trajectory] += place.shift_m
     moved[place.places] += place.bridge

@@ -24,7 +24,7 @@ _MAX_POINTS = 100
 
 
 class WantedDraws(NamedTuple):
-    """The number of draws, and of batches after which draws that are not on course end."""
+    """The requested number of draws, and the number of batches that must show enough progress."""
 
     number: int
     patience: int = _MAX_BATCHES
@@ -48,11 +48,12 @@ def importance_draws(
 ) -> WeightedDraws:
     """Return weighted draws in batches, until they suffice (`is_enough`) or `_MAX_BATCHES` exist.
 
-    After the wanted patience they also end where as many effective ones in each batch as so far
-    would not suffice.
+    After `wanted.patience` batches they also end if `_MAX_BATCHES` would not suffice at the present
+    rate.
 
-    Each batch is of a surrogate, `now` at first, that is refined by the draws so far; its chains
-    start about `start` (f,). All draws are weighted as draws of the mixture of the surrogates.
+    Each batch is drawn from a surrogate, `now` at first, that all earlier draws have refined; its
+    chains start about `start` (f,). All draws are weighted as draws of the mixture of the
+    surrogates.
     """
     centre = surrogate.transform(coordinates, start)
     draws = wanted.number

@@ -34,7 +34,7 @@ class Whitener(NamedTuple):
     lines: FloatArray = np.zeros((0, 0))
     """(3 m, w) orthonormal columns that are removed from white residuals, see `lines`."""
     low_rank: FloatArray = np.zeros((0, 0))
-    """(3 m, k) columns C, after which w - C C'w are white, see `front_axle`."""
+    """(3 m, k) columns C that make w - C C'w white, see `front_axle`."""
 
 
 def project_out_noise(noise: Whitener, white: FloatArray) -> FloatArray:
@@ -97,7 +97,7 @@ def _off_and_on_bridge(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the autocovariances (2, lags) of the mismatch off and on the bridge, and weights.
 
-    The weights (2, m) are those of both, which are independent, in each filtered residual.
+    The mismatch of a filtered residual is the sum of two independent ones with weights (2, m).
     """
     if road.pavement is None:
         raise ValueError("the bridge has the road's pavement")
@@ -111,11 +111,11 @@ def _off_and_on_bridge(
 
 @summing
 def _cholesky(one: FloatArray, differing: FloatArray, weight: FloatArray, a: FloatArray) -> bool:
-    """Factor the banded covariance that repeats the rows `one` (3, band + 1) to a (n, band + 1).
+    """Factor a banded covariance into `a` (n, band + 1); it repeats the rows `one` (3, band + 1).
 
-    To the first kind of rows are added covariances `differing` (k, lags) with weights (k, m). Rows
-    of the factor converge to rows that repeat too; from there on they are copied, until the weights
-    change.
+    Covariances `differing` (k, lags) with weights (k, m) are added to the first kind of rows. Rows
+    of the factor converge to rows that repeat too; from there on they are copied until the weights
+    change. Return False if the covariance is not positive definite.
     """
     n, width = a.shape
     band = width - 1

@@ -18,9 +18,10 @@ def maximum_likelihood_levels(
     """Return the most likely levels (s,) of shapes (s, f) in a periodogram (f,), and a statistic.
 
     `known` (f,) is the spectrum without them. The statistic is the likelihood ratio 2 ln(L/L_0) of
-    independent frequencies: the sum over all of them, halved because a taper correlates neighbours.
-    Every level is multiplied by the root of its observed over its expected power, the latter plus
-    `prior_power` from a prior, until none changes by more than `tolerance`.
+    independent frequencies, halved because a taper correlates neighbours. The iteration begins at
+    `start` (s,): every level is multiplied by the root of the ratio of its observed to its expected
+    power, the latter plus `prior_power` (s,) from a prior, until none changes by more than
+    `tolerance`, or for `_PASSES` passes.
     """
     level = start
     for _ in range(_PASSES):
