@@ -1,7 +1,7 @@
 """The forward and the inverse problem: arrays and NamedTuples in, arrays and NamedTuples out.
 
-Nothing here opens a file or a socket, reads a clock or prints; numpy, numba and scipy are all it
-imports. Units are SI throughout; `x` is the chainage of `docs/contract.md`.
+Nothing here opens a file or a socket, reads a clock or prints, and nothing but numpy, numba and
+scipy is imported. Units are SI throughout; `x` is the chainage of `docs/contract.md`.
 """
 
 import sys
@@ -23,6 +23,6 @@ def _put_off(*names: str) -> None:
         setattr(np, name.rpartition(".")[2], module)
 
 
-# SciPy takes all names that NumPy has, and so would import what nobody here uses: a twentieth of a
-# start, and 9 MB.
+# SciPy accesses all names of NumPy, and so would import these modules, which nothing here uses: a
+# twentieth of the start-up time, and 9 MB.
 _put_off("numpy.f2py", "numpy.testing", "numpy.ctypeslib")

@@ -124,9 +124,10 @@ ELEMENT: Final = ParameterSpec("EI", "N·m²", BRIDGE, "flexural_rigidity_nm2", 
 PAIRS: Final = ("unsprung_mass_kg", "tyre_stiffness_n_per_m", "tyre_damping_ns_per_m")
 """Keys of the rows that always belong to the two compared axles."""
 SPRINGS: Final = ("suspension_stiffness_n_per_m", "suspension_damping_ns_per_m")
-"""Keys of springs and dampers. Those of an equalised tandem are not estimated, and the values are
-of the front axle and of the axles behind it together."""
+"""Keys of springs and dampers. For an equalised tandem they are not estimated; their pair is that
+of the front axle and of the tandem's axles together."""
 DERIVED_UNITS: Final = {"m_s": "kg", "m_s1": "kg", "m_s2": "kg"}
+"""Units of the masses that are derived from parameters (`physics.models.body_masses`)."""
 
 
 def index_of(name: str) -> int:
