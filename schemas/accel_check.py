@@ -30,7 +30,8 @@ from schemas.topics import check_identifier
 
 _VARINT = rb"[\x80-\xff]{0,9}[\x00-\x7f]"
 _HEADER = re.compile(rb"\x08\x01" + b"".join(rb"\x%02x" % tag + _VARINT for tag in b"\x10\x18 ("))
-"""Version 1, boot_id, sequence, device and wall time. A zero is not encoded: another form."""
+"""Version 1, boot_id, sequence, device and wall time. A header with a zero has another form,
+because a zero is not encoded."""
 _BEFORE = re.compile(
     rb"\x32(%b)(\x08[\x00-\x7f])?\x11(.{8})\x1a(%b)" % (_VARINT, _VARINT), re.DOTALL
 )
@@ -87,7 +88,7 @@ def _stamp_if_usual(payload: bytes) -> Stamp | None:
     if not samples or len(names) > MAX_CHANNELS:
         return None
     every = np.frombuffer(b"".join(samples), _FLOAT64)
-    # numpy's product would release the interpreter's lock, and other threads would take it.
+    # A product of arrays would release the interpreter's lock, which other threads would take.
     if not np.maximum.reduce(np.abs(every)) <= MAX_ACCELERATION_M_PER_S2:  # false for a NaN
         return None
     try:

@@ -14,9 +14,10 @@ _MAX_TEXT_CHARACTERS = 1000
 
 
 class Acknowledgement(StrictModel):
-    """An operator's note of an alarm; the state at its time is the new baseline."""
+    """An operator's acknowledgement of an alarm; the state at this time is the new baseline."""
 
     edition: Literal[1] = 1
+    """Format version."""
     by: Annotated[str, Field(min_length=1, max_length=200)]
     time: Finite
     """Seconds since 1970 UTC."""
@@ -41,7 +42,8 @@ class Alarm(StrictModel):
     versions. Comparable with the threshold of the same alarm only."""
     threshold: Finite
     ratio: Finite
-    """EI of the element after the change over EI before, with its 95 % interval."""
+    """Ratio of the element's EI after the change to EI before; the next two bound its 95 %
+    interval."""
     ratio_q025: Finite
     ratio_q975: Finite
     acknowledged: Acknowledgement | None = None

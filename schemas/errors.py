@@ -14,7 +14,7 @@ class InputError(ValueError):
 def one_line(text: str) -> str:
     """Return a text without line breaks and terminal control characters.
 
-    Names in files and messages may come from anybody.
+    Names in files and messages are not trusted.
     """
     spaced = " ".join(text.split())
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in spaced)

@@ -1,9 +1,10 @@
 """The part of a crossing's result that fusion needs: its likelihood of the shared parameters.
 
-Up to a constant the log-likelihood of x is -|R x - z|²/2. The vector x holds the parameters of the
+Up to a constant the log-likelihood of x is -|R x - z|²/2. The vector x has the parameters of the
 bridge and of the truck, and coefficients in mm of the long waves of the profile mismatch. With
-`bends` follow the longitudinal offset from the estimate in m and the curvature terms. It contains
-no prior of the first three, nor the truck's total mass, to which all rigidities are proportional.
+`bends`, x continues with the longitudinal offset from the estimate in m and the curvature terms.
+The likelihood contains no prior of bridge, truck and mismatch, nor the truck's total mass, to which
+all rigidities are proportional.
 """
 
 from typing import Annotated
@@ -52,13 +53,13 @@ class Bends(StrictModel):
     (b,)."""
     size: tuple[Annotated[Finite, Field(gt=0)], ...] = ()
     """Units of moves of single coordinates: of the b bridge parameters, and in m of the offset.
-    Empty but in results from before the directions."""
+    Empty except in results of versions without `directions`."""
     shapes: tuple[Finite, ...]
     """Factors of all products of two moves, i <= j row by row, one curvature term after the other.
     """
     directions: tuple[Finite, ...] = ()
-    """Matrix (b + 1, b + 1), row by row, whose columns are the moves of unit size; empty where they
-    are those of single coordinates."""
+    """Matrix (b + 1, b + 1), row by row, whose columns are the moves of unit size; empty if `size`
+    gives moves of single coordinates."""
     logarithms: Annotated[int, Field(ge=0)] = 0
     """Number of the last parameters of the bridge, all elements, whose x enters as ln x, in moves
     and in R; zero in results of earlier versions."""
@@ -69,8 +70,8 @@ class ShortWaves(StrictModel):
 
     step_cycles_per_m: Annotated[Finite, Field(gt=0)]
     cosine: tuple[Finite, ...]
-    """Change of the bridge's x by cos(2 pi n x) m of mismatch, x the chainage: wave by wave for the
-    first parameter, then the next."""
+    """Change of the bridge's parameters in x by a mismatch of cos(2 pi n s) m at the chainage s:
+    wave by wave for the first parameter, then for the next."""
     sine: tuple[Finite, ...]
 
 
@@ -92,7 +93,7 @@ class FusionLikelihood(StrictModel):
     """Chainage of the first mismatch coefficient; None where both axles follow one profile."""
     knot_spacing_m: Annotated[Finite, Field(gt=0)]
     level_m3: tuple[Finite, ...]
-    """Level of the mismatch spectrum as this crossing estimates it."""
+    """Levels of the mismatch spectrum, one for each shape, as this crossing estimates them."""
     off_bridge_m: tuple[Stretch, ...] = ()
     """Mismatch before and after the bridge."""
     bends: Bends | None = None

@@ -11,7 +11,7 @@ from google.protobuf.message import Message
 
 
 def fill_fields(message: Message, values: Mapping[str, Any]) -> None:
-    """Set fields of a message; raise KeyError for a name that it has not."""
+    """Set fields of a message; raise KeyError for a name that the message lacks."""
     for name, value in values.items():
         field: Any = message.DESCRIPTOR.fields_by_name[name]
         if value is None:

@@ -67,8 +67,8 @@ def check_stamp(row: Topic, payload: bytes) -> Stamp:
     """Check a payload as far as its topic allows and return its times and identity.
 
     The time is the `log_time` of a recording: the wall time of the first sample of `accel`, of the
-    fix of `gnss` and `location`, and of the creation of any other message. ValueError names the
-    topic and the fault: too large, another message, another version, impossible values.
+    fix of `gnss` and `location`, and of the creation of any other message. Raise a ValueError that
+    names the topic and the fault: too large, another message, another version, impossible values.
     """
     try:
         if len(payload) > row.max_bytes:

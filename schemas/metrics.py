@@ -16,7 +16,7 @@ class Metric(NamedTuple):
     """A metric of a figure; every sample has the labels `realm` and `service`."""
 
     figure: str
-    """Figure of `health`; one that ends in `/` has a name behind it, the value of `label`."""
+    """Figure of `health`; one that ends in `/` is followed by a name, the value of `label`."""
     name: str
     kind: str
     text: str

@@ -193,7 +193,7 @@ LEFT_OUT_TEXTS: Final[dict[str, str]] = {
 
 
 def texts(reasons: Iterable[Reason], about: Mapping[Reason, str] | None = None) -> list[str]:
-    """Return the sentence of each reason in the same order, with the names that it concerns."""
+    """Return the sentence of each reason in the same order; `about` has the names it concerns."""
     names = about or {}
     return [
         f"{REASON_TEXTS[reason].removesuffix('.')}: {names[reason]}."

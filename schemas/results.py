@@ -31,7 +31,8 @@ class Prior(StrictModel):
     location: Finite
     """Nominal value."""
     scale: Finite
-    """Relative standard deviation of log_normal, half width of uniform, else in the unit."""
+    """Relative standard deviation of log_normal, half width of uniform; otherwise the standard
+    deviation, or that of the normal of half_normal, in the parameter's unit."""
 
 
 class Parameter(StrictModel):
@@ -107,7 +108,8 @@ class RoadMismatch(StrictModel):
     common_share: Annotated[Finite, Field(ge=0, le=1)] | None = None
     """Share of its power common to all runs of a wheel-path group; None for a single run."""
     bridge_ratio: Annotated[Finite, Field(gt=0)] | None = None
-    """Its amplitude on the bridge over that off it, in waves of 1 m; None in older results."""
+    """Ratio of its amplitude on the bridge to that off it, in waves of 1 m; None in older
+    results."""
 
 
 class RoadResult(StrictModel):
@@ -132,7 +134,7 @@ class RoadResult(StrictModel):
 
 
 _RETIRED_REASONS: Final = frozenset({"tyre_damping_ignored"})
-"""Reasons of older programs, which always gave another one with them."""
+"""Reasons that only older programs gave, always together with another reason."""
 
 
 def _drop_retired_reasons(values: object) -> object:
@@ -144,7 +146,7 @@ def _drop_retired_reasons(values: object) -> object:
 
 
 HUM = ("line_hz", "line_2_hz", "line_3_hz")
-"""Names of the diagnostics of hum that was removed."""
+"""Names of the diagnostics with the frequencies of removed hum."""
 
 
 class CrossingResult(StrictModel):
@@ -160,6 +162,7 @@ class CrossingResult(StrictModel):
     speed_m_per_s: Finite
     method: Method
     certificate: str | None = None
+    """Hash of the validation record of vehicle and bridge; None without one."""
     verdict: Verdict
     reasons: tuple[Reason, ...] = ()
     reason_texts: tuple[str, ...] = ()
@@ -169,6 +172,7 @@ class CrossingResult(StrictModel):
     parameters: dict[str, Parameter] | None
     """None if rejected."""
     scale_error: Finite | None = None
+    """Relative standard deviation of the EI error that all elements share."""
     covariance: Covariance | None = None
     derived: Derived | None = None
     road: RoadResult | None = None
@@ -331,7 +335,7 @@ def is_torsion_declared(crossing: CrossingResult) -> bool:
 def first_compared_axle(crossing: CrossingResult) -> int:
     """Return the number of the first of the two axles whose profiles were compared.
 
-    It is 2 for a truck with a tandem, which alone has a share of the load.
+    It is 2 for a truck with a tandem, whose results alone have the parameter `share`.
     """
     return 2 if "share" in (crossing.parameters or {}) else 1
 
@@ -374,7 +378,7 @@ class LowestElement(NamedTuple):
 
 
 def lowest_element(crossing: CrossingResult) -> LowestElement | None:
-    """Return the element with the smallest EI over the nominal value of its prior; None if none."""
+    """Return the element with the smallest EI relative to its prior's nominal value, or None."""
     found = [
         LowestElement(name, value.mean / nominal, value.q025 / nominal, value.q975 / nominal)
         for name, value in (crossing.parameters or {}).items()

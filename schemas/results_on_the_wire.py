@@ -1,7 +1,7 @@
 """Conversion of `schemas.results` to and from protobuf messages.
 
 Most fields have one name in both (`message_fields`); this module converts the others. Times are
-seconds since 1970 UTC there and nanoseconds here.
+seconds since 1970 UTC in results and nanoseconds in messages.
 """
 
 import json

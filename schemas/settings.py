@@ -23,6 +23,7 @@ class IdentificationSettings(BaseModel):
     starts: Annotated[int, Field(ge=1, le=20)] = 3
     """Number of starts of least squares: the nominal values, then others until it converges."""
     particles: Annotated[int, Field(ge=4, le=100_000)] = 500
+    """Number of particles of method `random_walk`; the next is the number of their steps."""
     steps: Annotated[int, Field(ge=1, le=100_000)] = 600
     draws: Annotated[int, Field(ge=100, le=1_000_000)] = 1200
     """Posterior draws of method `pre`, all chains together, before convergence is assessed."""

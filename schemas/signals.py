@@ -326,7 +326,7 @@ def _parse(message: pb.AccelBatch | pb.GnssFix | pb.VehicleInfo, payload: bytes)
 
 
 def _name(channel: pb.AccelChannel) -> str:
-    """Return the name of a channel: that of its position, or its own without one of the four."""
+    """Return the name of a channel: that of its position if it is one of the four, else its own."""
     if channel.position == pb.SENSOR_POSITION_UNSPECIFIED and channel.name:
         return channel.name
     name = ACCEL_NAMES.get(channel.position)

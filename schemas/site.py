@@ -1,4 +1,4 @@
-"""The site file: trucks and bridges, with the prior knowledge of them.
+"""The site file: trucks and bridges, with prior knowledge about them.
 
 Field names are the keys of the TOML file (docs/contract.md). Pairs are [front, rear]. A `…_spread`
 is a relative standard deviation of a log-normal prior, unless its name carries a unit.
@@ -47,10 +47,12 @@ class Sensor(Table):
     `sensors`."""
     gravity_included: StrictBool = False
     up: tuple[Sign, Sign, Sign, Sign] = (1, 1, 1, 1)
+    """Sign of each channel: 1 if it reads upward accelerations as positive, else -1."""
     gain_spread: Spread = 0.01
-    """Standard deviation between channels."""
+    """Standard deviation of each channel's gain, independent of the others."""
     delay_spread_s: Annotated[Number, Field(ge=0, le=1)] = 0.0005
     common_gain_spread: Spread = 0.01
+    """Standard deviation of the gain that all channels share."""
 
     @model_validator(mode="after")
     def _is_possible(self) -> "Sensor":

@@ -38,6 +38,7 @@ _ALIKE: Final = (
     "tyre_stiffness_n_per_m",
     "tyre_damping_ns_per_m",
 )
+"""Keys of an axle whose values become pairs under the same key."""
 
 
 def in_pairs(table: Any) -> Any:
@@ -82,7 +83,7 @@ def in_pairs(table: Any) -> Any:
 
 
 def _with_tracks(axles: tuple[Axle, ...], default: Any) -> tuple[Axle, ...]:
-    """Return axles of which those without a track have the vehicle's, if that is one number."""
+    """Return the axles; those without a track get the vehicle's, if that is one number."""
     if isinstance(default, bool) or not isinstance(default, int | float):
         return axles
     return tuple(
@@ -184,7 +185,7 @@ def _centre_of_gravity(front: Axle, rear: Axle, table: dict[str, Any]) -> dict[s
     elif rear.load_kg is not None:
         behind, spread_kg = rear.load_kg, rear.load_kg * rear.load_kg_spread
     else:
-        assert front.load_kg is not None  # noqa: S101 - one of them is
+        assert front.load_kg is not None  # noqa: S101 - one of the two is given
         behind = total - front.load_kg
         spread_kg = math.hypot(front.load_kg * front.load_kg_spread, total * total_spread)
     sprung = total - front.unsprung_mass_kg - rear.unsprung_mass_kg
@@ -208,6 +209,6 @@ def _centre_of_gravity(front: Axle, rear: Axle, table: dict[str, Any]) -> dict[s
 
 
 def _number(value: Any, otherwise: float = 0.0) -> float:
-    """Return a positive number or `otherwise`; the model reports other values."""
+    """Return a number of at least zero, or `otherwise`; the model reports other values."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if is_number and 0.0 <= value < math.inf else otherwise

@@ -1,4 +1,4 @@
-"""`[bridge]` of a site file: a bridge of one or more spans with the prior knowledge of it."""
+"""`[bridge]` of a site file: a bridge of one or more spans with prior knowledge about it."""
 
 import math
 from collections.abc import Sequence
@@ -29,16 +29,17 @@ _MASS_PER_LENGTH_KG_PER_M: Final = (0.01, 1e6)
 _WAVE_SPEED_M_PER_S: Final = 6000.0
 """Largest wave speed of bridge materials: 5100 in steel, 4000 in concrete."""
 _GYRATION: Final = 0.25
-"""Largest radius of gyration over the span: a truss half as deep as it is long."""
+"""Largest radius of gyration relative to the span: a truss half as deep as it is long."""
 _SAG: Final = 0.1
-"""Largest deflection under self-weight over the span; 1/100 and less in real bridges."""
+"""Largest deflection under self-weight relative to the span; 1/100 and less in real bridges."""
 _SHORTEST_PART: Final = 1e-3
-"""Smallest length of an element over the span, and of a span over the bridge."""
+"""Smallest length of an element or a span relative to the whole bridge."""
 _SUPPORT_SPRING: Final = (1e-6, 1e6)
-"""Bounds of a rotational restraint over EI / span."""
+"""Bounds of a rotational restraint relative to EI / span."""
 _SMALLEST_COMPLIANCE_M_PER_N: Final = 1e-15
 _LIGHTEST_DECK_KG_PER_M, _SHORTEST_BRIDGE_M = 100.0, 5.0
-"""A deck of less is a laboratory's, and these are shorter."""
+"""Mass per length below which a deck is a laboratory model, and the largest length of such a
+model."""
 _USUAL_DAMPING: Final = (0.002, 0.15)
 
 Latitude = Annotated[Number, Field(ge=-89, le=89)]
@@ -94,7 +95,7 @@ class Bridge(Lane, Damping, WithSpreads):
     start_altitude_m: Altitude | None = None
     end_altitude_m: Altitude | None = None
     owner_id: Text | None = None
-    """The owner's name of the bridge."""
+    """Name of the bridge in its owner's records."""
     road_class: Literal["A", "B", "C", "D", "E"] | None = None
     """Road class of ISO 8608."""
     survey_speed_m_per_s: Annotated[Number, Field(gt=0, le=100)] | None = None
@@ -112,11 +113,11 @@ class Bridge(Lane, Damping, WithSpreads):
         """Nominal EI of each element."""
         if self.flexural_rigidity_per_element_nm2 is not None:
             return self.flexural_rigidity_per_element_nm2
-        assert self.flexural_rigidity_nm2 is not None  # noqa: S101 - the validator saw to it
+        assert self.flexural_rigidity_nm2 is not None  # noqa: S101 - the validator requires one
         return (self.flexural_rigidity_nm2,) * self.elements
 
     def nominal(self, key: str) -> tuple[float, ...]:
-        """Return the nominal values of a quantity: 0 for compliance and restraint of bearings."""
+        """Return the nominal values of a quantity; compliance and restraint of bearings are 0."""
         if key == "flexural_rigidity_nm2":
             return self.nominal_flexural_rigidity_nm2
         if key in ("support_rotational_stiffness_nm_per_rad", "support_compliance_m_per_n"):
@@ -170,7 +171,7 @@ class Bridge(Lane, Damping, WithSpreads):
 
     @property
     def ends_distance_m(self) -> float:
-        """Distance of the ends by their coordinates, to 0.1 %."""
+        """Distance between the ends by their coordinates, to 0.1 %."""
         return _distance_m(
             self.start_latitude_deg,
             self.start_longitude_deg,
@@ -232,7 +233,7 @@ class Bridge(Lane, Damping, WithSpreads):
         return self
 
     def _ends_meant(self) -> str:
-        """Return a hint what the coordinates of the ends may be; empty where it is not known."""
+        """Return a hint at the probable slip in the ends' coordinates; empty if none is likely."""
         ends = (
             (self.start_latitude_deg, self.start_longitude_deg),
             (self.end_latitude_deg, self.end_longitude_deg),
@@ -342,7 +343,7 @@ def _check_physics(bridge: Bridge) -> None:
 
 
 def _damping_meant(alpha: float, beta: float, omega: float) -> str:
-    """Return a hint what coefficients of damping may be; empty where it is not known."""
+    """Return a hint at the probable slip in a damping coefficient; empty if none is likely."""
     swapped = 0.5 * (beta / omega + alpha * omega)
     if alpha and _USUAL_DAMPING[0] <= swapped <= _USUAL_DAMPING[1]:
         return "; swapped with the other coefficient?"
@@ -359,6 +360,6 @@ def _first_hz(span_m: float, mass_kg_per_m: float, rigidity_nm2: float) -> float
 
 
 def _rigidities(span_m: float, mass_kg_per_m: float) -> tuple[float, float]:
-    """Return the EI at which a beam sags by a tenth of its span, and of the stiffest section."""
+    """Return the EI at which a beam sags by a tenth of its span, and EI of the stiffest section."""
     least = 5.0 * mass_kg_per_m * _G_M_PER_S2 * span_m**3 / (384.0 * _SAG)
     return least, mass_kg_per_m * (_WAVE_SPEED_M_PER_S * _GYRATION * span_m) ** 2

@@ -17,15 +17,16 @@ _KEYS: Final = ("damping_ratio", "first_frequency_hz")
 _COEFFICIENTS: Final = ("rayleigh_alpha_per_s", "rayleigh_beta_s")
 _MASS_AND_SPAN: Final = ("mass_per_length_kg_per_m", "span_m")
 _SECOND: Final = 4.0
-"""Second natural frequency over the first one."""
+"""Ratio of the second natural frequency to the first."""
 _FAR: Final = 3.0
-"""Factor between the given first frequency and that of EI and mass which is an error."""
+"""Factor between the given first frequency and that of EI and mass beyond which one is wrong."""
 
 
 class Damping(BaseModel):
     """Keys that take the place of the Rayleigh coefficients.
 
-    A valid site keeps only the declared frequency, to compare results with it.
+    Of these the model keeps the declared frequency, to compare results with it, and does not write
+    it.
     """
 
     damping_ratio: Annotated[Number, Field(gt=0, le=0.5)] | None = None
@@ -41,8 +42,9 @@ def rayleigh_of(ratio: float, first_hz: float) -> tuple[float, float]:
 def with_coefficients(table: Any) -> Any:
     """Return the table of a bridge with Rayleigh coefficients in place of ratio and frequency.
 
-    Keys that are wrong stay, for their own errors. Raise FieldError if only one is there, if the
-    coefficients are given as well, or if EI and mass give another frequency.
+    Wrong values stay in the table, so that the model reports them. Raise FieldError if only one of
+    ratio and frequency is given, if the coefficients are given as well, or if EI and mass give
+    quite another frequency.
     """
     if not isinstance(table, dict) or not any(key in table for key in _KEYS):
         return table

@@ -109,7 +109,7 @@ def _site_of(table: dict[str, Any], source_name: str) -> Site:
 def faults_of_site(toml_text: str, source_name: str) -> list[str]:
     """Return all errors of a site file, a line each; empty if it is valid.
 
-    Errors between several fields appear once each of them is valid.
+    Errors that concern several fields appear only when each of these is valid.
     """
     try:
         parse_site(toml_text, source_name)
@@ -143,8 +143,8 @@ def _too_many(table: dict[str, Any]) -> str | None:
 def site_hash(site: Site) -> str:
     """Return 16 hex digits that change with any value, however the file is laid out.
 
-    But for `[ros2]` and `[import]`, which define the sources of messages and their realm,
-    and nothing of what is in them.
+    `[ros2]` and `[import]` do not count: they define the source and the realm of messages, not
+    their content.
     """
     values = site.model_dump(by_alias=True, exclude={"ros2", "imports", "vehicles"})
     values["vehicle"] = [vehicle.shortest() for vehicle in site.vehicles]
@@ -202,5 +202,5 @@ def _value_text(value: Any) -> str:
         return f"{{ {', '.join(pairs)} }}"
     if isinstance(value, list | tuple) and any(isinstance(one, dict) for one in value):
         return f"[{', '.join(_value_text(one) for one in value)}]"
-    # JSON's numbers, strings, booleans and lists are TOML's; DEL alone must be escaped.
+    # JSON's numbers, strings, booleans and lists are valid TOML, except that DEL must be escaped.
     return json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")

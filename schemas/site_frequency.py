@@ -14,18 +14,20 @@ from schemas.toml_text import parse_toml
 _PIECES: Final = 40
 """Least number of finite elements of a bridge."""
 _GIVEN_OVER_IMPLIED: Final = (1.0 / 1.44, 1.44)
-"""EI by the given first frequency over the nominal one: a fifth in frequency."""
+"""Usual ratio of the EI that follows from the given first frequency to nominal EI: a fifth in
+frequency."""
 _LEAST_EI: Final = 0.5
-"""EI by the given frequency over the nominal one, below which the nominal EI is wrong.
+"""Ratio of the EI that follows from the given frequency to nominal EI, below which the latter is
+wrong.
 
 Restraint only raises a frequency, and a nominal EI may be off by 2.
 """
 _ABOVE_CLAMPED: Final = 1.2
-"""Least frequency over that of clamped ends which no restraint explains."""
+"""Ratio of the given frequency to that with clamped ends, above which no restraint explains it."""
 
 
 def first_frequency_hz(bridge: Bridge, *, is_clamped: bool = False) -> float:
-    """Return the first natural frequency of the nominal bridge, ends free to turn or clamped."""
+    """Return the first natural frequency of the nominal bridge, with ends hinged or clamped."""
     return _first_hz(
         bridge.lengths_m,
         bridge.nominal_flexural_rigidity_nm2,
@@ -36,7 +38,7 @@ def first_frequency_hz(bridge: Bridge, *, is_clamped: bool = False) -> float:
 
 
 def given_frequencies(toml_text: str) -> Iterator[ImpliedQuantity]:
-    """Yield the given first frequency of each bridge of a site file against that of its EI.
+    """Yield the given first frequency of each bridge of a site file, compared with that of its EI.
 
     Raise InputError if the text is not TOML.
     """
@@ -74,7 +76,7 @@ def _given(table: dict[str, Any]) -> ImpliedQuantity:
 
 
 def _other_span(bridge: Bridge, ratio: float) -> str:
-    """Return the span that has the given frequency, at the nominal EI; spans in words."""
+    """Return, in words, the span that has the given frequency at the nominal EI."""
     if bridge.interior_supports_m:
         return "other spans (span_m, interior_supports_m)"
     return f"a span_m of {bridge.span_m / ratio**0.25:.3g}"

@@ -23,7 +23,7 @@ class ImpliedQuantity(NamedTuple):
     is_certain: bool = True
     """Whether a value far out of its range cannot be right."""
     wrong_beyond: tuple[float, float] | None = None
-    """Values beyond which it is far out of its range; None: a factor of 2."""
+    """Limits beyond which it is far out of its range; None: a factor of 2 beyond the range."""
 
     @property
     def is_unusual(self) -> bool:

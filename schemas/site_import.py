@@ -4,7 +4,7 @@ from schemas.site_numbers import Identifier, Table
 
 
 class Import(Table):
-    """Table of how imported drives are filed; it does not concern what they measure."""
+    """Table that sets the realm of imported drives; it does not affect their measurements."""
 
     name: Identifier
     """Realm import-NAME of every drive that is imported with this site file."""

@@ -1,9 +1,10 @@
 """The keys of `[bridge]` for an eccentric lane, and the torsion that follows from them.
 
-On a deck of torsional rigidity GJ, wheels whose middle runs at the distance e from its axis sink
-there by e theta. Of e and GJ only g = e²/(GJ) is a parameter (docs/contract.md, `torsion`). Owners
-know the lane, and of the deck at best the ratio of its first torsional to its first bending
-frequency and the radius of gyration r of its cross-section. For a uniform deck
+On a deck of torsional rigidity GJ that rotates by theta, an axle whose centre is at the distance e
+from the deck's axis sinks by e theta. Of e and GJ only g = e²/(GJ) is a parameter
+(docs/contract.md, `torsion`). Owners know the lane and, at best, the ratio of the deck's first
+torsional to its first bending frequency and the radius of gyration r of its cross-section. For a
+uniform deck
 
     f_1 = pi/(2 L²) sqrt(EI/rho A),   f_t = ratio f_1,   GJ = rho A r² (2 L f_t)²
 
@@ -49,9 +50,9 @@ class Lane(BaseModel):
     """Position of the lane and torsion of the deck, as far as known."""
 
     lane_offset_m: Annotated[Number, Field(ge=-20, le=20)] | None = None
-    """Distance of the lane's middle to the left of the bridge's axis, seen from start to end."""
+    """Distance of the lane's centre to the left of the bridge's axis, seen from start to end."""
     torsional_frequency_ratio: Annotated[Number, Field(ge=0.2, le=100)] | None = None
-    """First torsional over first bending frequency."""
+    """Ratio of the first torsional to the first bending frequency."""
     deck_gyration_m: Annotated[Number, Field(ge=0.1, le=30)] | None = None
     """Radius of gyration of the cross-section about its axis."""
 

@@ -21,7 +21,7 @@ class RosImu(StrictModel):
 
     topic: RosTopic
     axis: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
-    """Axis of the sensor that points up; with a minus sign, down."""
+    """Vertical axis of the sensor: z if it points up, -z if it points down."""
     gravity_included: StrictBool = True
     """Whether an upward axis reads +g at rest, as REP 145 demands."""
     frame: Annotated[str, StringConstraints(min_length=1, max_length=255)] | None = None

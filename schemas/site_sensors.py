@@ -16,7 +16,8 @@ from schemas.site_numbers import Density, Identifier, Number, Rate, Table
 
 MAX_SENSORS: Final = 32
 IN_THE_MIDDLE_M: Final = 0.05
-"""Largest lateral distance of a sensor on the centre line, which is not known better."""
+"""Largest lateral distance at which a sensor counts as on the centre line: places are not known
+better."""
 _LARGEST_LEVER: Final = 3.0
 """Largest sum of the absolute weights of a centre reading; more amplifies gain errors too far.
 Sensors above both axles have 1, three corners of a frame 2."""
@@ -25,7 +26,8 @@ _TIME: Final = "time_s"
 _BEFORE_M, _BEHIND_M = 5.0, 10.0
 """Largest distances of a sensor on the body before the first and behind the last axle."""
 _ASIDE_M: Final = 2.0
-"""Largest lateral distance: half of a truck twice as wide as roads permit, or of its track."""
+"""Largest lateral distance, half of a truck twice as wide as roads permit; for a wider track, half
+of that."""
 ADVICE: Final = "put a second sensor on the other side, or this one in the middle"
 
 
@@ -78,8 +80,8 @@ def check_sensors(
 ) -> None:
     """Raise if the sensors do not give the four centre readings.
 
-    Of axles these are the two `compared`, by their numbers. A sensor on an axle ahead of them may
-    be there, and is not used.
+    The axle readings are those of the two axles `compared`, by number. A sensor on an axle ahead of
+    these is allowed and not used.
     """
     names: set[str] = set()
     for number, sensor in enumerate(sensors):

@@ -1,9 +1,9 @@
 """Tandems of a site file: the axles of `[[vehicle.axles]]` that are compared.
 
-Behind a front axle, two axles that share one spring force feel nearly the same road, and no spring
-is needed to know their forces. Of a tandem whose axles have springs of their own, the law of the
-springs gives the difference of the forces: friction of a few per cent of the load then hides the
-difference of the deflections.
+Two axles behind the front axle that share one spring force follow nearly the same road, and their
+forces are known without the springs' parameters. If each axle of a tandem has its own spring, the
+difference of their forces follows from the springs' law, and friction of a few per cent of the load
+hides the difference of the deflections.
 """
 
 import math
@@ -27,7 +27,7 @@ class Tandem(NamedTuple):
     first: Axle
     second: Axle
     share: float
-    """Share of the spring force, or of the static one, on the first axle of the tandem."""
+    """Share of the first axle in the tandem's spring force; in the static one if not equalised."""
     share_spread: float
     is_equalised: bool = True
     """Whether both axles share one spring force; else each has springs of its own."""
@@ -108,7 +108,7 @@ def _static_share(first: Axle, second: Axle) -> tuple[float, float]:
 
 
 def joined(tandem: Tandem) -> Axle:
-    """Return the axle that stands for both axles of the tandem: at their force, with their sums."""
+    """Return the axle in place of both: at their common force, with the sums of their values."""
     first, second = tandem.axles
     together: dict[str, float] = {
         key: getattr(first, key) + getattr(second, key)

@@ -17,10 +17,10 @@ from schemas.site_implied import MAX_BRIDGES, ImpliedQuantity
 
 _G_M_PER_S2: Final = 9.80665
 _FIRST_HZ: Final = (0.25, 4.0)
-"""First natural frequency over 100 Hz/L, L in m: a rule of thumb for road bridges."""
+"""First natural frequency relative to 100 Hz/L, L in m: a rule of thumb for road bridges."""
 _DAMPING: Final = (0.002, 0.15)
 _DEFLECTION: Final = (0.0, 1.0 / 250.0)
-"""Under the truck at rest in the middle, over the span."""
+"""Deflection relative to the span, under the truck at rest in the middle."""
 _BOUNCE_HZ: Final = (0.7, 6.0)
 _PITCH_HZ: Final = (0.5, 10.0)
 _HOP_HZ: Final = (4.0, 40.0)
@@ -31,15 +31,15 @@ _NOISE_UG: Final = (0.5, 5000.0)
 _STIFFNESS: Final = (("kN/m", 1e3), ("N/m times 1000", 1e-3))
 _TYRE_OVER_SPRING: Final = (0.9, 25.0)
 _FRONT_OVER_REAR: Final = (0.15, 2.5)
-"""Stiffness of a spring over the mass on it, front over rear: rear springs carry the load."""
+"""Ratio, front to rear, of a spring's stiffness to the mass on it: rear springs carry the load."""
 _AXLE_OVER_REAR: Final = (0.3, 1.4)
 _LOADS_REVERSED: Final = (2.0, 0.4)
-"""Least factor between the loads and what springs, tyres and axles are made for, and the largest
-share of it, in logarithms, that is left with the loads swapped."""
+"""Smallest factor between the ratio of the axle loads and that for which springs, tyres and axles
+are made, and the largest share of its logarithm that remains if the loads are swapped."""
 _RATIO_AS_ALPHA: Final = (0.003, 0.1)
 """Values of alpha in 1/s that are damping ratios of bridges."""
 _IDLE: Final = 0.25
-"""Share of beta's damping of the first mode below which alpha has no effect."""
+"""Ratio of alpha's damping of the first mode to beta's, below which alpha has no effect."""
 _ELEMENT_M: Final = 4.5
 """Usual length of an element."""
 _TYRE_WIDTH_M: Final = (0.1, 0.6)
@@ -50,12 +50,14 @@ _RIGIDITY: Final = (("kN·m²", 1e3), ("MN·m²", 1e6), ("GN·m²", 1e9))
 
 
 class Slip(NamedTuple):
-    """A key that may be in another unit, and the quantity that follows from a factor."""
+    """A key whose value may be in another unit, and its effect on an implied quantity."""
 
     key: str
     value: float
     quantity: Callable[[float], float]
+    """Function from a factor of `value` to the implied quantity."""
     units: tuple[tuple[str, float], ...]
+    """Possible units with their factors."""
 
 
 def implied_by(site: Site, vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
@@ -211,7 +213,7 @@ def of_sensors(sensor: Sensor, vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
 
 
 def of_bridge(bridge: Bridge, vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
-    """Yield first frequency and damping of a bridge, and what a truck does to it."""
+    """Yield first frequency, damping and mesh of a bridge, and a truck's effect on it."""
     span, rigidity, mass = bridge.uniform()
     per_element = bridge.flexural_rigidity_per_element_nm2 is not None
     key = "flexural_rigidity_" + ("per_element_nm2" if per_element else "nm2")
@@ -331,7 +333,7 @@ def _meant(value: float, limits: tuple[float, float], slips: tuple[Slip, ...]) -
 
 
 def _power(value: float, exponent: float) -> Callable[[float], float]:
-    """Return how a quantity follows from a factor of what it goes with a power of."""
+    """Return the function from a factor of a key's value to `value` times a power of the factor."""
     return lambda factor: value * factor**exponent
 
 

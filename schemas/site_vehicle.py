@@ -66,7 +66,7 @@ class WithSpreads(Table):
 
 
 class Vehicle(WithSpreads):
-    """A truck with two axles, or a front axle and a tandem. Nominal values are of a data sheet.
+    """A truck with two axles, or a front axle and a tandem; nominal values are from a data sheet.
 
     With a tandem, pairs are those of the front axle and of the tandem's axles together, and the
     wheelbase ends at their common force.
@@ -92,9 +92,9 @@ class Vehicle(WithSpreads):
     """Tread widths; with the next four they determine the profile mismatch of the axles."""
     tyre_contact_length_m: PositivePair | None = None
     twin_tyre_distance_m: NotNegativePair | None = None
-    """Distance between the middles of twin tyres; 0 for single ones."""
+    """Distance between the centres of twin tyres; 0 for single tyres."""
     track_m: Annotated[tuple[Track, Track] | None, BeforeValidator(_two)] = None
-    """Distance between the middles of the left and right wheels of each axle."""
+    """Distance between the centres of the left and right wheels of each axle."""
     rear_axle_offset_m: Annotated[Number, Field(ge=-1, le=1)] | None = None
     """Distance of the rear axle's path to the left of the front axle's."""
     sensors: Annotated[tuple[PlacedSensor, ...], Field(max_length=MAX_SENSORS)] = ()
@@ -122,7 +122,7 @@ class Vehicle(WithSpreads):
 
     @property
     def tandem(self) -> Tandem | None:
-        """The tandem behind the front axle."""
+        """The tandem behind the front axle; None for a truck of two axles."""
         return tandem_of(self.axles, self.bogies) if self.axles else None
 
     @property

@@ -95,7 +95,7 @@ def parse_query(parameters: Mapping[str, str]) -> SpoolQuery | None:
 
 
 def encode_contents(time_ns: int, boots: list[SpoolBoot]) -> bytes:
-    """Return the SpoolContents message; beyond `MAX_RANGES` ranges, of the newest."""
+    """Return the SpoolContents message, with the newest `MAX_RANGES` ranges at most."""
     message = pb.SpoolContents(schema_version=SCHEMA_VERSION, time_ns=time_ns)
     left = MAX_RANGES
     for boot in reversed(boots):
@@ -147,7 +147,7 @@ def encode_page(query: SpoolQuery, next_sequence: int | None) -> bytes:
 
 
 def decode_page(payload: bytes, query: SpoolQuery) -> int | None:
-    """Return the next sequence to ask for, None at the end; raise ValueError for a wrong page."""
+    """Return the next sequence to request, None at the end; raise ValueError for a wrong page."""
     try:
         message = pb.SpoolPage.FromString(payload)
     except DecodeError as error:

@@ -67,7 +67,7 @@ class Message(NamedTuple):
     log_time_ns: int
     """Wall time of the first sample, ns since 1970 UTC."""
     publish_time_ns: int
-    """Wall time at which the writer got it, ns since 1970 UTC."""
+    """Wall time at which the writer received it, ns since 1970 UTC."""
 
 
 HEALTH_PERIOD_S = 60.0
@@ -217,9 +217,9 @@ def parse_key(text: str) -> Key:
 
 
 def selector(realm: str | None, owner: str, stream: str = "*") -> str:
-    """Return the key expression of one or all streams of all owners of a kind in a realm or any.
+    """Return the key expression of one stream, or of all, of all owners of a kind.
 
-    `realm` may be a pattern as in `check_realms`.
+    `realm` may be a pattern as in `check_realms`; None is any realm.
     """
     return f"{PREFIX}/{realm_chunk(realm)}/{owner}/*/{stream}"
 

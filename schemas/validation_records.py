@@ -19,7 +19,7 @@ from schemas.site import Site
 from schemas.strict_model import Finite, StrictModel
 
 METHOD_EDITION: Final = 13
-"""Version of the answers of method `pre`. Raise it with every change that may alter an answer;
+"""Version of the results of method `pre`. Raise it with every change that may alter a result;
 earlier validation records become void. It is independent of the program's version, because most
 versions leave the method unchanged and it may change between two versions."""
 
@@ -108,6 +108,7 @@ class ValidationFigures(StrictModel):
     rms_z: Finite | None = None
     """RMS of the error of ln EI over its standard deviation."""
     largest_z_good: Finite | None = None
+    """Largest absolute value of this ratio among crossings with the verdict good."""
     std: Finite | None = None
     """Median relative standard deviation of EI."""
     weak: int
@@ -139,7 +140,7 @@ class ValidationRecord(StrictModel):
     seed: Annotated[int, Field(ge=0, lt=1 << 64)]
     conditions: ValidationConditions
     planned: Annotated[int, Field(ge=1)]
-    """Number of crossings, unless fewer were conclusive."""
+    """Planned number of crossings; fewer are simulated if they are conclusive."""
     crossings: tuple[ValidationCrossing, ...]
     figures: ValidationFigures
     passed: bool

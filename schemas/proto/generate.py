@@ -1,6 +1,6 @@
-"""Writes `driveby_pb2.py` and `.pyi` from `driveby.proto`: `python -m schemas.proto.generate`.
+"""Write `driveby_pb2.py` and `.pyi` from `driveby.proto`: `python -m schemas.proto.generate`.
 
-Needs grpcio-tools (in the development requirements). A test generates into another folder and
+This needs grpcio-tools (in the development requirements). A test generates into another folder and
 compares, so the committed code cannot drift from the .proto file.
 """
 
