@@ -177,9 +177,9 @@ def validation_path(folder: Path, digest: str) -> Path:
     return folder / f"{digest}.json"
 
 
-def validation_json(certificate: ValidationRecord) -> str:
+def validation_json(record: ValidationRecord) -> str:
     """Return the text of a validation record's file."""
-    return certificate.model_dump_json(indent=1) + "\n"
+    return record.model_dump_json(indent=1) + "\n"
 
 
 def load_validation(path: Path) -> ValidationRecord:

@@ -129,18 +129,18 @@ def compliance_normal(found: Optimum) -> ComplianceNormal:
 
 
 def marginal(
-    precision: FloatArray, linear: FloatArray, sampled: NDArray[np.int64]
+    precision: FloatArray, linear: FloatArray, kept: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return precision (k, k) and linear part (k,) of the coordinates `sampled` (k,) alone.
+    """Return precision (k, k) and linear part (k,) of the coordinates `kept` (k,) alone.
 
     All other coordinates of the normal with this precision (f, f) and linear part (f,) are
     integrated out.
     """
-    others = np.delete(np.arange(linear.size), sampled)
+    others = np.delete(np.arange(linear.size), kept)
     factor = cho_factor(precision[np.ix_(others, others)], lower=True)
-    across = precision[np.ix_(others, sampled)]
+    across = precision[np.ix_(others, kept)]
     led = across.T @ cho_solve(factor, np.column_stack([across, linear[others]]))
-    return precision[np.ix_(sampled, sampled)] - led[:, :-1], linear[sampled] - led[:, -1]
+    return precision[np.ix_(kept, kept)] - led[:, :-1], linear[kept] - led[:, -1]
 
 
 def from_normal(

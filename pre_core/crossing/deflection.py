@@ -143,15 +143,15 @@ def add_deflection(
     """Add the bridge's deflection to `road` (which is minus the input profile)."""
     front = points.position_m[k]
     n = work.road.shape[1]
-    gives = crossing.basis.stiffness.shape[0] - (points.theta.shape[1] - EI_1) > 2
-    if gives:
+    is_compliant = crossing.basis.stiffness.shape[0] - (points.theta.shape[1] - EI_1) > 2
+    if is_compliant:
         work.end_force[:] = 0.0
         work.end_share[:] = 0.0
         work.at_end[:] = False
     for w in range(work.part.shape[0]):
         modal_response.precompensate_force(work.load[w], work.sharp[w])
         _soften_ends(crossing, front, work.part[w], work.place[w], work.sharp[w])
-        if gives:
+        if is_compliant:
             offset = 0.0 if w == 0 else -crossing.direction * points.wheelbase_m[k]
             if w == 2:
                 offset = crossing.direction * crossing.lead.ahead_m

@@ -207,7 +207,7 @@ def is_accepted(problem: PosteriorProblem, chi2: float) -> bool:
     return chi2 < 1.0 + excess + _ACCEPTED_Z * float(np.sqrt(2.0 / judged))
 
 
-def is_better_misfit(chi2: float, last: float) -> bool:
+def is_refit_worthwhile(chi2: float, last: float) -> bool:
     """Return whether another fit is worthwhile after one that took chi2 from `last` to `chi2`."""
     return chi2 <= max(_CLEAR_MISFIT_CHI2, (1.0 - SMALL_IMPROVEMENT) * last)
 
@@ -361,7 +361,7 @@ def _fit_in_noise_rounds(
         last_chi2, chi2 = chi2, chi2_per_dof(problem, y)
         if not problem.force.any() or chi2 > HOPELESS_CHI2:
             break
-        if not is_better_misfit(chi2, last_chi2):
+        if not is_refit_worthwhile(chi2, last_chi2):
             break
         before, problem = problem, refresh_noise(problem, y)
         if abs(before.force.sum() - problem.force.sum()) <= _SAME_LEVEL * before.force.sum():

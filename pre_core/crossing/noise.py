@@ -202,7 +202,7 @@ def noise_spectrum(
         spectrum[0, 0] += (
             friction
             / REDUCED_WEIGHT_FACTOR
-            * tandem.friction_passage(truck.lead, truck.theta, truck.gap_m, truck.lag_s, omega)
+            * tandem.friction_transfer(truck.lead, truck.theta, truck.gap_m, truck.lag_s, omega)
         )
     elif force.any():
         spectrum[[1, 2], [1, 2]] += _suspension_noise_spectra(truck, force, omega)

@@ -31,7 +31,7 @@ from pre_core.crossing.fit import (
     fit_all,
     fit_stage,
     is_accepted,
-    is_better_misfit,
+    is_refit_worthwhile,
     resting_mode_indices,
 )
 from pre_core.crossing.misfit import OffBridgeFit, fit_off_bridge, is_explained_off_bridge
@@ -383,7 +383,7 @@ def _is_last_offset(best: Optimum, found: Optimum, last_chi2: float, tried: int)
     if strategy is not None and strategy.uses_suspension and found.chi2_per_dof > NO_FIT_CHI2:
         return True
     may_be_last = strategy is not None or found.problem.force.any()
-    if may_be_last and not is_better_misfit(found.chi2_per_dof, last_chi2):
+    if may_be_last and not is_refit_worthwhile(found.chi2_per_dof, last_chi2):
         return True
     return best.chi2_per_dof > _HOPELESS_CHI2[min(tried, len(_HOPELESS_CHI2)) - 1]
 

@@ -233,7 +233,7 @@ def update_noise(
     mismatch, that on the bridge is `pavement`, by default estimated at y.
     """
     where = layout(problem)
-    unknowns = where.gains.stop
+    coordinates = where.gains.stop
     if has_tandem(problem):
         force = no_suspension_noise() if problem.crossing.lead.is_equalised else force
         problem = with_lead_motion(problem, y)
@@ -251,7 +251,7 @@ def update_noise(
     if differs and pavement is None:
         pavement = estimate_pavement(problem, y, mismatch, front_axle)
     road = problem.mismatch._replace(level_m3=mismatch, pavement=pavement if differs else None)
-    at, trucks = _displaced_points(problem, y, unknowns, is_inertial=bool(force.any()))
+    at, trucks = _displaced_points(problem, y, coordinates, is_inertial=bool(force.any()))
     density = problem.density * (1.0 + at.gain)
     count = row_count(problem.rows, problem.crossing.rows)
     residual_force = REDUCED_WEIGHT_FACTOR * force
@@ -261,7 +261,7 @@ def update_noise(
     changed = problem._replace(force=force, mismatch=road)
     slope = _noise_gradient(changed, trucks, density)
     if differs:
-        slope = np.concatenate([slope, np.zeros(where.delays.stop - unknowns)])
+        slope = np.concatenate([slope, np.zeros(where.delays.stop - coordinates)])
         slope += mismatch_gradient(changed, y)
     basis = change_basis(problem.crossing.basis, at.theta[0])
     for work in problem.works:

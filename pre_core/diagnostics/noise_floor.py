@@ -50,23 +50,23 @@ class Density(NamedTuple):
     in ten seconds at 500 Hz and less for more samples, larger for motion of wheels or frame."""
 
 
-def density(still: NoiseSegment) -> Density | None:
+def density(segment: NoiseSegment) -> Density | None:
     """Return the noise density of one channel; None for too few samples, or only motion."""
-    low = _STANDING_BAND_HZ if still.is_standing else _DRIVING_BAND * still.rate_hz
-    high = _TOP_OF_BAND * still.rate_hz
-    if high <= low or (not still.is_standing and low < _WHEELS_HZ):
+    low = _STANDING_BAND_HZ if segment.is_standing else _DRIVING_BAND * segment.rate_hz
+    high = _TOP_OF_BAND * segment.rate_hz
+    if high <= low or (not segment.is_standing and low < _WHEELS_HZ):
         return None
-    size = round(_PIECE_S * still.rate_hz)
-    count = still.values.size // size
-    pieces = still.values[: count * size].reshape(count, size)
+    size = round(_PIECE_S * segment.rate_hz)
+    count = segment.values.size // size
+    pieces = segment.values[: count * size].reshape(count, size)
     pieces = pieces[np.isfinite(pieces).all(axis=1)]
     if pieces.shape[0] < _FEWEST_PIECES:
         return None
     window = np.hanning(size)
     centred = window * (pieces - pieces.mean(axis=1, keepdims=True))
     power = np.abs(np.fft.rfft(centred, axis=1)) ** 2
-    power *= 2.0 / (still.rate_hz * float(window @ window))
-    frequency = np.fft.rfftfreq(size, 1.0 / still.rate_hz)
+    power *= 2.0 / (segment.rate_hz * float(window @ window))
+    frequency = np.fft.rfftfreq(size, 1.0 / segment.rate_hz)
     # An impact is in some pieces, an engine's line at some frequencies: medians ignore both.
     typical = np.median(power, axis=0) / _MEDIAN_OF_POWER
     edges = np.searchsorted(frequency, np.linspace(low, high, _PARTS + 1))

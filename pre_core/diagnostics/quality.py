@@ -349,30 +349,30 @@ class ResidualBin(NamedTuple):
     size: int
 
 
-def bin_excess(cell: ResidualBin, expected: float = 1.0) -> float:
+def bin_excess(part: ResidualBin, expected: float = 1.0) -> float:
     """Return how far a bin's mean square exceeds `expected`, in standard deviations.
 
     Wilson and Hilferty: the cube root of chi squared over its degrees of freedom is nearly normal.
     """
-    if cell.size == 0:
+    if part.size == 0:
         return 0.0
-    spread = 2.0 / (9.0 * cell.size)
-    return float((np.cbrt(cell.mean_square / expected) - 1.0 + spread) / np.sqrt(spread))
+    spread = 2.0 / (9.0 * part.size)
+    return float((np.cbrt(part.mean_square / expected) - 1.0 + spread) / np.sqrt(spread))
 
 
 def residual_bins(
-    white: FloatArray, stretches: NDArray[np.int64], step_s: float, edges_hz: FloatArray
+    white: FloatArray, segments: NDArray[np.int64], step_s: float, edges_hz: FloatArray
 ) -> dict[tuple[int, int, int], ResidualBin]:
     """Return mean squares of whitened residuals (m, kinds) by kind, segment and band.
 
-    `stretches` (m,) has the number of the segment of each row. The cosine transform of a segment is
+    `segments` (m,) has the number of the segment of each row. The cosine transform of a segment is
     orthogonal: for white residuals of unit variance every coefficient is a standard normal, and
     coefficient k of n belongs to the frequency k/(2 n step). Band b lies between `edges_hz` b and b
     + 1.
     """
     found: dict[tuple[int, int, int], ResidualBin] = {}
-    for stretch in np.unique(stretches).tolist():
-        rows = white[stretches == stretch]
+    for segment in np.unique(segments).tolist():
+        rows = white[segments == segment]
         power = cosine_transform(rows) ** 2
         frequency = np.arange(rows.shape[0]) / (2.0 * rows.shape[0] * step_s)
         band = np.searchsorted(edges_hz, frequency, side="right") - 1
@@ -381,7 +381,7 @@ def residual_bins(
             for kind in range(white.shape[1]):
                 count = chosen.shape[0]
                 mean = float(chosen[:, kind].mean()) if count else 0.0
-                found[kind, stretch, b] = ResidualBin(mean, count)
+                found[kind, segment, b] = ResidualBin(mean, count)
     return found
 
 

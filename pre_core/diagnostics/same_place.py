@@ -47,8 +47,8 @@ def sprung_correlation(
     stiffness, damping = spring
     n = axle_m_per_s2.size
     s = 2j * np.pi * np.fft.rfftfreq(n, step_s)
-    passage = (damping * s + stiffness) / (s**2 + damping * s + stiffness)
-    sprung = np.fft.irfft(np.fft.rfft(axle_m_per_s2) * passage, n)
+    transfer = (damping * s + stiffness) / (s**2 + damping * s + stiffness)
+    sprung = np.fft.irfft(np.fft.rfft(axle_m_per_s2) * transfer, n)
     smooth = _band_passed(np.stack([body_m_per_s2, sprung]), step_s, _BOUNCE_BAND_HZ)
     return _correlation(smooth[0], smooth[1], travelled_m, -ahead_m)
 

@@ -52,7 +52,7 @@ class _CurvedCrossing(NamedTuple):
 
     form: CurvedForm
     squares: FloatArray  # (f, f) form of the features
-    pull: FloatArray  # (f, s): features to the linear part of shared variables
+    linear: FloatArray  # (f, s): features to the linear part of shared variables
     precision: FloatArray  # (s, s) of shared variables
     places: NDArray[np.int64]
     """Indices (s,) of these variables among all shared ones."""
@@ -75,19 +75,19 @@ class CurvedSum(NamedTuple):
         x = y.copy()
         x[:, -e:] = np.exp(-self.sigma * y[:, -e:])
         squares = np.sum(y * y, axis=1)
-        pull = np.zeros((y.shape[0], self.factor[0].shape[0]))
+        linear = np.zeros((y.shape[0], self.factor[0].shape[0]))
         of_each = pool.map(partial(_squares_and_pull, x), self.crossings)
-        for one, (of_squares, of_pull) in zip(self.crossings, of_each, strict=True):
+        for one, (of_squares, of_linear) in zip(self.crossings, of_each, strict=True):
             squares += of_squares
-            pull[:, one.places] += of_pull
-        squares -= np.sum(pull * cho_solve(self.factor, pull.T).T, axis=1)
+            linear[:, one.places] += of_linear
+        squares -= np.sum(linear * cho_solve(self.factor, linear.T).T, axis=1)
         return np.asarray(-0.5 * squares)
 
 
 def _squares_and_pull(x: FloatArray, of: _CurvedCrossing) -> tuple[FloatArray, FloatArray]:
     """Return a crossing's squares (k,) and linear parts (k, s) of shared variables, x (k, b)."""
     features = of.form.features(x)
-    return np.sum((features @ of.squares) * features, axis=1), features @ of.pull
+    return np.sum((features @ of.squares) * features, axis=1), features @ of.linear
 
 
 def curved_sum(

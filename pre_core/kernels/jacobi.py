@@ -20,7 +20,7 @@ is far below rounding."""
 @inner
 def _rotation(a: FloatArray, p: int, q: int, cosine: FloatArray, sine: FloatArray) -> float:
     """Compute cosine and sine (4,) that annul a_pq; return how far a_pq² exceeds the negligible."""
-    left = -1.0
+    excess = -1.0
     for lane in range(LANES):
         off = a[p, q, lane]
         app = a[p, p, lane]
@@ -31,8 +31,8 @@ def _rotation(a: FloatArray, p: int, q: int, cosine: FloatArray, sine: FloatArra
         c = 1.0 / np.sqrt(1.0 + t * t)
         cosine[lane] = c
         sine[lane] = t * c
-        left = max(left, off * off - _NEGLIGIBLE * np.abs(app * aqq))
-    return left
+        excess = max(excess, off * off - _NEGLIGIBLE * np.abs(app * aqq))
+    return excess
 
 
 @inner
@@ -60,12 +60,12 @@ def diagonalise(a: FloatArray, v: FloatArray) -> bool:
     cosine = np.empty(LANES)
     sine = np.empty(LANES)
     for _ in range(MAX_SWEEPS):
-        left = -1.0
+        excess = -1.0
         for p in range(m - 1):
             row_p = a[p]
             for q in range(p + 1, m):
                 row_q = a[q]
-                left = max(left, _rotation(a, p, q, cosine, sine))
+                excess = max(excess, _rotation(a, p, q, cosine, sine))
                 c = (cosine[0], cosine[1], cosine[2], cosine[3])
                 s = (sine[0], sine[1], sine[2], sine[3])
                 n = (-s[0], -s[1], -s[2], -s[3])
@@ -84,7 +84,7 @@ def diagonalise(a: FloatArray, v: FloatArray) -> bool:
                 v_p, v_q = v[p], v[q]
                 for k in range(m):
                     _rotate(v_p, k, v_q, k, c, s, n)
-        if left <= 0.0:
+        if excess <= 0.0:
             return True
     return False
 
@@ -125,7 +125,7 @@ def _sweep(a: FloatArray, v: FloatArray) -> bool:
     one = np.uintp(1)
     m = np.uintp(a.shape[0])
     for _ in range(MAX_SWEEPS):
-        left = False
+        has_excess = False
         for p in range(m - one):
             for q in range(p + one, m):
                 off, app, aqq = a[p, q], a[p, p], a[q, q]
@@ -133,7 +133,7 @@ def _sweep(a: FloatArray, v: FloatArray) -> bool:
                 if size <= _NEGLIGIBLE**2 * np.abs(app * aqq):
                     continue
                 # Written so that a NaN counts as not converged.
-                left = left or not size <= _NEGLIGIBLE * np.abs(app * aqq)
+                has_excess = has_excess or not size <= _NEGLIGIBLE * np.abs(app * aqq)
                 half = 0.5 * (aqq - app)
                 root = np.sqrt(half * half + size)
                 t = off / (half + (root if half >= 0.0 else -root))
@@ -152,6 +152,6 @@ def _sweep(a: FloatArray, v: FloatArray) -> bool:
                 for k in range(m):
                     x, y = v[p, k], v[q, k]
                     v[p, k], v[q, k] = c * x - s * y, s * x + c * y
-        if not left:
+        if not has_excess:
             return True
     return False

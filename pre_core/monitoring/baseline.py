@@ -91,7 +91,7 @@ class Innovation(NamedTuple):
     value: FloatArray  # (m, n)
     covariance: FloatArray  # (m, n, n) of it
     across: FloatArray  # (n, size): observation matrix
-    gain: FloatArray  # (m, size, n): covariance of state and innovation, not the Kalman gain
+    cross_covariance: FloatArray  # (m, size, n): of state and innovation
 
 
 def scales_compared() -> Scales:
@@ -160,25 +160,25 @@ def filter_step(state: BaselineState, period: Period) -> Innovation:
     """Return the innovation of a period at the time of the state."""
     across, noise = _rows(state, period)
     n = len(across)
-    gain = state.covariance @ across.T
+    cross_covariance = state.covariance @ across.T
     own = state.scales.change[:, None, None] ** 2 * _alike(n)
-    covariance = across @ gain + noise + own
+    covariance = across @ cross_covariance + noise + own
     value = period.observation.value - state.mean @ across.T
-    return Innovation(value, covariance, across, gain)
+    return Innovation(value, covariance, across, cross_covariance)
 
 
 def update_state(state: BaselineState, innovation: Innovation) -> tuple[BaselineState, FloatArray]:
     """Return the state after an innovation, and the Kalman gain (m, size, n)."""
-    weight = np.asarray(
-        np.linalg.solve(innovation.covariance, innovation.gain.transpose(0, 2, 1)).transpose(
-            0, 2, 1
-        )
+    gain = np.asarray(
+        np.linalg.solve(
+            innovation.covariance, innovation.cross_covariance.transpose(0, 2, 1)
+        ).transpose(0, 2, 1)
     )
-    mean = state.mean + (weight @ innovation.value[:, :, None])[:, :, 0]
-    covariance = state.covariance - weight @ innovation.gain.transpose(0, 2, 1)
+    mean = state.mean + (gain @ innovation.value[:, :, None])[:, :, 0]
+    covariance = state.covariance - gain @ innovation.cross_covariance.transpose(0, 2, 1)
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
     log = state.log_weight + log_density(innovation)
-    return state._replace(mean=mean, covariance=covariance, log_weight=log - log_sum(log)), weight
+    return state._replace(mean=mean, covariance=covariance, log_weight=log - log_sum(log)), gain
 
 
 def log_density(innovation: Innovation) -> FloatArray:

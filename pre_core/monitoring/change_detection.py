@@ -174,8 +174,8 @@ def detect_change(
             inflation = max(1.0, (np.abs(rows[number]).max() / MAX_STANDARDISED) ** 2)
             drift = state.places["drift"]
             if is_judged[number]:
-                state, weight = _update_unless_outlier(state, innovation, inflation)
-                chart = update_chart(chart, number, kept, drift, weight, innovation, inflation)
+                state, gain = _update_unless_outlier(state, innovation, inflation)
+                chart = update_chart(chart, number, kept, drift, gain, innovation, inflation)
                 ratio, _ = log_ratio(chart, state, number)
                 statistic[number] = _in_deviations(ratio)
                 found = _alarm(chart, state, number, ratio, rules)
@@ -183,8 +183,8 @@ def detect_change(
                     standing = _since(before[found.since], some[found.since : number + 1])
             else:
                 wider = innovation._replace(covariance=inflation * innovation.covariance)
-                state, weight = update_state(state, wider)
-                chart = skip_period(chart, kept, drift, weight, innovation)
+                state, gain = update_state(state, wider)
+                chart = skip_period(chart, kept, drift, gain, innovation)
             state, chart = _without_unlikely_scales(state, chart)
             stay = {*chart.begins, *kept_for}
             before = {begin_at: one for begin_at, one in before.items() if begin_at in stay}

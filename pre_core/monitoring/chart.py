@@ -73,13 +73,13 @@ def select_chart_scales(chart: Chart, kept: NDArray[np.bool_]) -> Chart:
 
 
 def skip_period(
-    chart: Chart, kept: FloatArray, drift: slice, weight: FloatArray, innovation: Innovation
+    chart: Chart, kept: FloatArray, drift: slice, gain: FloatArray, innovation: Innovation
 ) -> Chart:
     """Return the chart after a period that is not tested.
 
-    `kept` (m,), `drift` and `weight` (m, size, n) are as in `update_chart`.
+    `kept` (m,), `drift` and `gain` (m, size, n) are as in `update_chart`.
     """
-    return chart._replace(response=_responded(chart, kept, drift, weight, innovation)[0])
+    return chart._replace(response=_responded(chart, kept, drift, gain, innovation)[0])
 
 
 def update_chart(
@@ -87,14 +87,14 @@ def update_chart(
     number: int,
     kept: FloatArray,
     drift: slice,
-    weight: FloatArray | None,
+    gain: FloatArray | None,
     innovation: Innovation,
     inflation: float,
 ) -> Chart:
     """Return the chart after a period.
 
     `number` is the period's, `kept` (m,) the remaining share of the drift since the previous
-    period, `drift` the drift's indices in the state, `weight` (m, size, n) the Kalman gain (None
+    period, `drift` the drift's indices in the state, `gain` (m, size, n) the Kalman gain (None
     without an update), `inflation` the factor of the innovation's covariance.
     """
     m, size, _, n = chart.response.shape
@@ -105,7 +105,7 @@ def update_chart(
         np.concatenate([chart.score, np.zeros((m, 1, n))], axis=1),
     )
     c = len(chart.begins)
-    response, shown = _responded(chart, kept, drift, weight, innovation)
+    response, shown = _responded(chart, kept, drift, gain, innovation)
     flat = shown.reshape(m, n, c * n)
     covariance = inflation * innovation.covariance
     solved = np.linalg.solve(
@@ -129,7 +129,7 @@ def _responded(
     chart: Chart,
     kept: FloatArray,
     drift: slice,
-    weight: FloatArray | None,
+    gain: FloatArray | None,
     innovation: Innovation,
 ) -> tuple[FloatArray, FloatArray]:
     """Return F after a period, and G (m, n, c, n)."""
@@ -138,8 +138,8 @@ def _responded(
     before[:, drift] *= kept[:, None, None, None]
     shown = -(innovation.across @ before.reshape(m, size, c * n)).reshape(m, n, c, n)
     shown += np.eye(n)[:, None, :]
-    if weight is not None:
-        before += (weight @ shown.reshape(m, n, c * n)).reshape(m, size, c, n)
+    if gain is not None:
+        before += (gain @ shown.reshape(m, n, c * n)).reshape(m, size, c, n)
     return before, shown
 
 

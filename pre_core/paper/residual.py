@@ -45,7 +45,7 @@ class Workspace(NamedTuple):
     state: FloatArray  # (m, 2, 4)
     force: FloatArray  # (2, stretch, 4)
     road: FloatArray  # (2, n, 4): minus the two road profiles
-    seen: FloatArray  # (q, 4): inner products of the residuals and the nuisance columns
+    projection: FloatArray  # (q, 4): inner products of the residuals and the nuisance columns
 
 
 def workspace(window: PaperWindow) -> Workspace:
@@ -173,7 +173,7 @@ def march_four(
         theta, window.total_mass_kg, window.wheelbase_m, window.gravity_m_per_s2, factors
     )
     work.state[:] = 0.0
-    work.seen[:] = 0.0
+    work.projection[:] = 0.0
     columns = window.nuisance.shape[1]
     front, rear = work.road[0], work.road[1]
     rows = window.front_sample.size
@@ -190,13 +190,13 @@ def march_four(
             r = scale(fma_scalar(load(front, n + 3), -w[3], r), window.row_weight[row])
             squares = fma(r, r, squares)
             for q in range(columns):
-                seen = fma_scalar(r, window.nuisance[row, q], load(work.seen, q))
-                store(work.seen, q, seen)
+                projection = fma_scalar(r, window.nuisance[row, q], load(work.projection, q))
+                store(work.projection, q, projection)
         if columns == 0 and _all_beyond(squares, limit):
             break
     for q in range(columns):
-        seen = load(work.seen, q)
-        squares = sub(squares, mul(seen, seen))
+        projection = load(work.projection, q)
+        squares = sub(squares, mul(projection, projection))
     for lane in range(LANES):
         if np.isfinite(squares[lane]):
             total[lane] = squares[lane]
@@ -298,7 +298,7 @@ def objective(window: PaperWindow, work: Workspace, theta: FloatArray) -> float:
         four, window.total_mass_kg, window.wheelbase_m, window.gravity_m_per_s2, factors
     )
     work.state[:] = 0.0
-    work.seen[:] = 0.0
+    work.projection[:] = 0.0
     columns = window.nuisance.shape[1]
     rows = window.front_sample.size
     total = 0.0
@@ -318,9 +318,9 @@ def objective(window: PaperWindow, work: Workspace, theta: FloatArray) -> float:
             r = (r - rear[row + window.first_row, 0]) * window.row_weight[row]
             total += r * r
             for q in range(columns):
-                work.seen[q, 0] += window.nuisance[row, q] * r
+                work.projection[q, 0] += window.nuisance[row, q] * r
     for q in range(columns):
-        total -= work.seen[q, 0] ** 2
+        total -= work.projection[q, 0] ** 2
     return total if np.isfinite(total) else np.inf
 
 

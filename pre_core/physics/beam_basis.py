@@ -97,10 +97,10 @@ def beam_basis(
     """
     n = element_lengths_m.size
     lengths = np.repeat(element_lengths_m / parts, parts)
-    give = (1.0, 1.0) if has_compliant_bearings else (0.0, 0.0)
+    compliances = (1.0, 1.0) if has_compliant_bearings else (0.0, 0.0)
     unit = uniform_beam(1.0, np.ones(n * parts), 1.0, 0.0, 0.0)._replace(
         element_lengths_m=lengths,
-        support_compliance_m_per_n=give,
+        support_compliance_m_per_n=compliances,
         interior_supports=tuple(node * parts for node in interior_supports),
     )
     held = supported_nodes(unit)
@@ -210,12 +210,12 @@ def modal_filters(
             matrix[k, k, lane] = 1.0 / np.sqrt(theta[lane, RHO_A] * b_0)
     for e in range(basis_cubics.shape[0]):
         for k in range(m):
-            size = load(matrix[k], k)
+            scale = load(matrix[k], k)
             for power in range(4):
                 total = (0.0, 0.0, 0.0, 0.0)
                 for i in range(m):
                     total = fma_scalar(load(vectors[k], i), basis_cubics[e, power, i], total)
-                store(cubics[e, k], power, mul(total, size))
+                store(cubics[e, k], power, mul(total, scale))
     return True
 
 
@@ -242,18 +242,18 @@ def diagonalise_bridge(
 
 @inner
 def shape_cubics(
-    basis_cubics: FloatArray, vectors: FloatArray, size: FloatArray, out: FloatArray
+    basis_cubics: FloatArray, vectors: FloatArray, scale: FloatArray, out: FloatArray
 ) -> None:
     """Compute cubics of all modes in every part: `out` (parts, g, 4, 4) [part, group, power, mode].
 
-    `vectors` (m, m) has the modes in its rows, each of which is multiplied by its `size` (m,).
+    `vectors` (m, m) has the modes in its rows, each of which is multiplied by its `scale` (m,).
     """
-    m = np.uintp(size.size)
-    turned = np.empty((size.size, size.size))
+    m = np.uintp(scale.size)
+    turned = np.empty((scale.size, scale.size))
     for k in range(m):
         for i in range(m):
-            turned[i, k] = size[k] * vectors[k, i]
-    row = np.empty(size.size)
+            turned[i, k] = scale[k] * vectors[k, i]
+    row = np.empty(scale.size)
     for e in range(basis_cubics.shape[0]):
         for power in range(4):
             # Adjacent modes share the vector registers.
@@ -262,7 +262,7 @@ def shape_cubics(
                 one = basis_cubics[e, power, i]
                 for k in range(m):
                     row[k] += one * turned[i, k]
-            for k in range(size.size):
+            for k in range(scale.size):
                 out[e, k // LANES, power, k % LANES] = row[k]
 
 
@@ -287,16 +287,16 @@ def modal_filters_one(
     a = 2.0 / step_s
     cubics[:] = 0.0
     feedback[:] = 0.0
-    size = np.empty(basis.stiffness.shape[1])
-    for k in range(size.size):
+    scale = np.empty(basis.stiffness.shape[1])
+    for k in range(scale.size):
         group, lane = k // LANES, k % LANES
         eigenvalue = matrix[k, k] / theta[RHO_A]
         damping = modal_damping(theta, eigenvalue)
         b_0 = a * a + a * damping + eigenvalue
         feedback[group, 0, lane] = -4.0 * eigenvalue / b_0
         feedback[group, 1, lane] = (a * a - a * damping - 3.0 * eigenvalue) / b_0
-        size[k] = 1.0 / np.sqrt(theta[RHO_A] * b_0)
-    shape_cubics(basis.cubics, vectors, size, cubics)
+        scale[k] = 1.0 / np.sqrt(theta[RHO_A] * b_0)
+    shape_cubics(basis.cubics, vectors, scale, cubics)
     return True
 
 

@@ -125,8 +125,8 @@ def modal_filters(
     cubics[:] = 0.0
     feedback[:] = 0.0
     one = np.empty(COEFFICIENTS)
-    size = np.empty(basis.stiffness.shape[1])
-    for k in range(size.size):
+    scale = np.empty(basis.stiffness.shape[1])
+    for k in range(scale.size):
         group, lane = k // LANES, k % LANES
         eigenvalue = matrix[k, k] / theta[RHO_A]
         damping = modal_damping(theta, eigenvalue)
@@ -135,11 +135,11 @@ def modal_filters(
             return False
         for i in range(COEFFICIENTS):
             feedback[group, i, lane] = one[i]
-        size[k] = np.sqrt(total / theta[RHO_A])
+        scale[k] = np.sqrt(total / theta[RHO_A])
         modes[k, 0], modes[k, 1] = eigenvalue, damping
         # In coordinates that diagonalise a similar bridge, a mode is nearly a unit vector.
         modes[k, 2] = np.sqrt(total) if vectors[k, k] >= 0.0 else -np.sqrt(total)
-    shape_cubics(basis.cubics, vectors, size, cubics)
+    shape_cubics(basis.cubics, vectors, scale, cubics)
     return True
 
 

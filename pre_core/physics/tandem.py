@@ -117,7 +117,7 @@ def own_springs(lead: Lead, gap: float) -> OwnSprings:
     return OwnSprings(first, second, first / both, second / both)
 
 
-def friction_passage(
+def friction_transfer(
     lead: Lead, theta: FloatArray, gap: float, lag_s: float, omega: FloatArray
 ) -> FloatArray:
     """Return the factor (f,) from friction's power in F_b to that in R_1 - R_2, in m²/N².

@@ -145,11 +145,11 @@ def torsion_filters(
             group, lane = first + span * GROUPS + j // LANES, j % LANES
             for i in range(COEFFICIENTS):
                 feedback[group, i, lane] = one[i]
-            size = np.sqrt(total * per_mass)
+            scale = np.sqrt(total * per_mass)
             for part in range(cubics.shape[0]):
                 for power in range(4):
                     inside = basis.span_of_part[part] == span
-                    value = size * basis.cubics[part, power, j] if inside else 0.0
+                    value = scale * basis.cubics[part, power, j] if inside else 0.0
                     cubics[part, group, power, lane] = value
     return True
 

@@ -41,9 +41,9 @@ def torsional_modes(beam: Beam) -> TorsionalModes:
     cubics = np.zeros((lengths.size, 4, omega.size))
     for number, span in enumerate(spans):
         own = slice(number * _MODES, (number + 1) * _MODES)
-        size = np.sqrt(2.0 * flexibility * speed**2 / (span[1] - span[0]))
+        scale = np.sqrt(2.0 * flexibility * speed**2 / (span[1] - span[0]))
         for e in np.flatnonzero((edges[:-1] >= span[0]) & (edges[1:] <= span[1])):
-            cubics[e, :, own] = size * sine_cubics(edges[e : e + 2], span, _MODES)
+            cubics[e, :, own] = scale * sine_cubics(edges[e : e + 2], span, _MODES)
     eigenvalues = np.ravel(omega) ** 2
     damping = beam.rayleigh_alpha_per_s + beam.rayleigh_beta_s * eigenvalues
     return TorsionalModes(eigenvalues, damping, cubics)

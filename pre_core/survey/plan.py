@@ -131,7 +131,7 @@ def _of_bridge(crossing: CrossingLikelihood, own: FloatArray | None) -> FloatArr
 
 
 def survey_information(
-    tracks: Sequence[PlannedPathGroup], crossings: float, bridge: int
+    groups: Sequence[PlannedPathGroup], crossings: float, bridge: int
 ) -> FloatArray:
     """Return the precision (b, b) of the bridge after a number of `crossings`.
 
@@ -139,11 +139,11 @@ def survey_information(
     its parameters.
     """
     total = np.zeros((bridge, bridge))
-    each = crossings / sum(len(track.precisions) for track in tracks)
-    for track in tracks:
-        precision = each * np.sum(track.precisions, axis=0)
-        if track.common is not None:
-            precision[bridge:, bridge:] += track.common
+    each = crossings / sum(len(group.precisions) for group in groups)
+    for group in groups:
+        precision = each * np.sum(group.precisions, axis=0)
+        if group.common is not None:
+            precision[bridge:, bridge:] += group.common
             precision, _ = marginal(precision, np.zeros(precision.shape[0]), np.arange(bridge))
         total += precision
     return total

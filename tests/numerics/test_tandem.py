@@ -46,7 +46,7 @@ from pre_core.parameters import (
     table,
 )
 from pre_core.physics.surface import Footprint
-from pre_core.physics.tandem import NO_LEAD, Lead, friction_passage, shared_load
+from pre_core.physics.tandem import NO_LEAD, Lead, friction_transfer, shared_load
 from pre_core.physics.vehicle import masses_above_axles
 from pre_core.search import levenberg_marquardt
 from pre_core.search.loop import Termination
@@ -313,7 +313,7 @@ def test_friction_passes_to_the_profiles_as_a_projection() -> None:
     # Friction of unit power in both springs, less the part that the moment determines.
     left = np.eye(2) - np.outer(levers, levers) / (levers @ levers)
     in_moment = (levers @ levers) / (share * levers[0] + (1.0 - share) * levers[1]) ** 2
-    for w, found in zip(omega, friction_passage(lead, theta, 1.35, lag_s, omega), strict=True):
+    for w, found in zip(omega, friction_transfer(lead, theta, 1.35, lag_s, omega), strict=True):
         tyres = theta[K_U1 : K_U1 + 2] + 1j * w * theta[C_U1 : C_U1 + 2]
         to_profiles = np.array([np.exp(-1j * w * lag_s), -1.0]) / tyres
         expected = to_profiles @ left @ left.T @ to_profiles.conj()
