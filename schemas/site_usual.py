@@ -317,12 +317,12 @@ def _implied(
     slips: tuple[Slip, ...],
 ) -> ImpliedQuantity:
     low, high = limits
-    meant = "" if low <= value <= high else _meant(value, limits, slips)
+    meant = "" if low <= value <= high else _meant(limits, slips)
     return ImpliedQuantity(name, text, value, low, high, unit, meant)
 
 
-def _meant(value: float, limits: tuple[float, float], slips: tuple[Slip, ...]) -> str:
-    """Return the first key that, in another unit, brings the value into its range."""
+def _meant(limits: tuple[float, float], slips: tuple[Slip, ...]) -> str:
+    """Return a hint at the first key that, in another unit, brings the quantity into its range."""
     for slip in slips:
         for unit, factor in slip.units:
             if limits[0] <= slip.quantity(factor) <= limits[1]:

@@ -58,12 +58,12 @@ class SpoolQuery(NamedTuple):
         return f"boot={self.boot_id};from={self.first};to={self.last}"
 
 
-def spool_selector(realm: str | None, vehicle: str | None = None, stream: str | None = None) -> str:
-    """Return the key expression of spools, of all realms, vehicles or streams that are not given.
+def spool_selector(realm: str | None, vehicle: str | None = None) -> str:
+    """Return the key expression of the spools of all streams of a vehicle, or of all vehicles.
 
-    `realm` may be a pattern as in `check_realms`.
+    `realm` may be a pattern as in `check_realms`; None is any realm.
     """
-    return f"{PREFIX}/{realm_chunk(realm)}/vehicle/{vehicle or '*'}/{stream or '*'}{SUFFIX}"
+    return f"{PREFIX}/{realm_chunk(realm)}/vehicle/{vehicle or '*'}/*{SUFFIX}"
 
 
 def spool_key(where: Key) -> str:
