@@ -36,8 +36,7 @@ from pre_core.crossing.nuisances import ResidualParts, nuisances_of
 from pre_core.crossing.preparation import replace_mismatch
 from pre_core.crossing.response_surface import response_surface
 from pre_core.crossing.surface_posterior import curved_coordinates, surface_points
-from pre_core.fusion.curvature import CurvatureTerms
-from pre_core.fusion.curvature import linearise_with_curvature as straightened_about
+from pre_core.fusion.curvature import CurvatureTerms, linearise_with_curvature
 from pre_core.fusion.linearised import of_optimum, of_surface
 from pre_core.fusion.long_waves import (
     OffBridgeMismatch,
@@ -190,7 +189,9 @@ def linearised_likelihood(
     priors = np.zeros((truck + q, truck + q))
     priors[:truck, :truck] = np.eye(truck)
     priors[truck:, truck:] = mismatch
-    root, target = straightened_about(crossing.root, crossing.target, crossing.bends, at, priors)
+    root, target = linearise_with_curvature(
+        crossing.root, crossing.target, crossing.bends, at, priors
+    )
     return crossing._replace(root=root, target=target, bends=None)
 
 

@@ -30,9 +30,6 @@ compiled = partial(njit, cache=True, nogil=True, no_cfunc_wrapper=True)
 # compiles and one that loads compiled kernels can differ in the last digits. So all are inlined.
 _inlined = partial(compiled, error_model="numpy", forceinline=True)
 
-# Every operation is rounded as written.
-exact = _inlined()
-
 # Contraction allows fused multiply-add; no other reordering of the arithmetic is allowed, so that
 # results depend only to rounding on which vectors are evaluated together.
 _CONTRACTED = {"contract", "nsz"}
@@ -44,6 +41,7 @@ summing = _inlined(fastmath={"contract", "nsz", "reassoc"})
 # For kernels that only kernels call: a call from Python would crash the process.
 _inner = partial(_inlined, no_cpython_wrapper=True)
 inner = _inner(fastmath=_CONTRACTED)
+# Every operation is rounded as written.
 inner_exact = _inner()
 
 

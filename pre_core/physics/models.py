@@ -35,14 +35,11 @@ def from_models(car: HalfCar, beam: Beam) -> FloatArray:
 
 
 def beam_from(
-    theta: FloatArray,
-    element_lengths_m: FloatArray,
-    interior_supports: tuple[int, ...] = (),
-    wave_speed_m_per_s: float = 0.0,
+    theta: FloatArray, element_lengths_m: FloatArray, interior_supports: tuple[int, ...] = ()
 ) -> Beam:
     """Return the bridge of theta (p,) over supports at its ends and at the given nodes.
 
-    The torsional wave speed is not a parameter of theta.
+    The torsional wave speed, which is no parameter of theta, is zero.
     """
     rigidities = theta[EI_1:]
     return Beam(
@@ -55,7 +52,6 @@ def beam_from(
         (float(theta[F]), float(theta[F + 1])),
         interior_supports,
         float(theta[TORSION]),
-        wave_speed_m_per_s,
     )
 
 

@@ -67,11 +67,6 @@ class SimulatedFixes(NamedTuple):
     speed_m_per_s: FloatArray
 
 
-def quantisation_m_per_s2(range_m_per_s2: float, bits: int) -> float:
-    """Return the step of a converter of `bits` bits over plus and minus the range."""
-    return 2.0 * range_m_per_s2 / 2.0**bits
-
-
 def measure_acceleration(
     acceleration_m_per_s2: FloatArray,
     rate_hz: float,

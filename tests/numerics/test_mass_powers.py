@@ -45,10 +45,8 @@ def test_accelerations_stay_where_everything_follows_its_power_of_the_mass() -> 
 
     def accelerations(of: FloatArray, mass_kg: float) -> FloatArray:
         car = car_from(of, mass_kg)
-        beam = beam_from(
-            of,
-            BEAM.element_lengths_m,
-            wave_speed_m_per_s=BEAM.torsional_wave_speed_m_per_s,
+        beam = beam_from(of, BEAM.element_lengths_m)._replace(
+            torsional_wave_speed_m_per_s=BEAM.torsional_wave_speed_m_per_s
         )
         felt = under_wheels(road, motion, car.wheelbase_m, 1)
         return simulate(car, beam, motion, felt, Discretisation(STEP_S)).acceleration_m_per_s2
