@@ -7,8 +7,6 @@ The curve is a cubic B-spline x(t) that minimises
 which leaves constant speed and constant acceleration unpenalised (P-splines; Eilers and Marx 1996).
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from scipy.linalg import lstsq
 
@@ -21,13 +19,6 @@ _JERK_M_PER_S3 = 0.3
 """Scale s_j of the jerk of a steadily driven truck: root of its square integrated over a second."""
 
 
-class Trajectory(NamedTuple):
-    """A fitted curve; `standardised_rms` is the RMS of the fixes' residuals over their noise."""
-
-    spline: Spline
-    standardised_rms: float
-
-
 def fit_trajectory(
     time_s: FloatArray,
     position_m: FloatArray,
@@ -37,8 +28,8 @@ def fit_trajectory(
     speed_noise_m_per_s: float,
     start_s: float,
     stop_s: float,
-) -> Trajectory:
-    """Fit x(t) over [start, stop] to fixes (m,) of position and signed velocity.
+) -> Spline:
+    """Return x(t) over [start, stop] fitted to fixes (m,) of position and signed velocity.
 
     Raise ValueError for fewer than two fixes.
     """
@@ -66,34 +57,31 @@ def fit_trajectory(
     system = np.vstack([fixes * weight[:, None], jerk / _JERK_M_PER_S3])
     right = np.concatenate([measured * weight, np.zeros(jerk.shape[0])])
     coefficients = lstsq(system, right)[0]
-    residual = (fixes @ coefficients - measured) * weight
     greville = np.lib.stride_tricks.sliding_window_view(knots[1:-1], degree).mean(axis=1)
-    spline = Spline(knots, coefficients + line(greville), degree)
-    return Trajectory(spline, float(np.sqrt(np.mean(residual**2))))
+    return Spline(knots, coefficients + line(greville), degree)
 
 
-def motion_at(trajectory: Trajectory, time_s: FloatArray, direction: int) -> Motion:
+def motion_at(trajectory: Spline, time_s: FloatArray, direction: int) -> Motion:
     """Return position, speed and acceleration of the front axle at times (n,).
 
     The acceleration is positive when speeding up.
     """
-    spline = trajectory.spline
     return Motion(
-        value_at(spline, time_s),
-        value_at(spline, time_s, 1),
-        direction * value_at(spline, time_s, 2),
+        value_at(trajectory, time_s),
+        value_at(trajectory, time_s, 1),
+        direction * value_at(trajectory, time_s, 2),
     )
 
 
 def arrival_time_s(
-    trajectory: Trajectory, position_m: float, direction: int, start_s: float, stop_s: float
+    trajectory: Spline, position_m: float, direction: int, start_s: float, stop_s: float
 ) -> float:
     """Return the first time from `start_s` to `stop_s` at which the front axle reaches a chainage.
 
     NaN if it does not.
     """
     t = np.linspace(start_s, stop_s, max(2, round((stop_s - start_s) / 0.01) + 1))
-    beyond = direction * (value_at(trajectory.spline, t) - position_m) >= 0.0
+    beyond = direction * (value_at(trajectory, t) - position_m) >= 0.0
     first = int(np.argmax(beyond))
     if not beyond[first]:
         return float("nan")
@@ -102,7 +90,7 @@ def arrival_time_s(
     low, high = float(t[first - 1]), float(t[first])
     for _ in range(60):
         middle = 0.5 * (low + high)
-        if direction * (value_at(trajectory.spline, np.array([middle]))[0] - position_m) >= 0.0:
+        if direction * (value_at(trajectory, np.array([middle]))[0] - position_m) >= 0.0:
             high = middle
         else:
             low = middle

@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 from pydantic import ValidationError
 
-from pre_core.crossing.splines import value_at
-from pre_core.crossing.trajectory import Trajectory, arrival_time_s, fit_trajectory, motion_at
+from pre_core.crossing.splines import Spline, value_at
+from pre_core.crossing.trajectory import arrival_time_s, fit_trajectory, motion_at
 from pre_core.physics.simulate import Motion
 from pre_core.search.loop import Report
 from schemas import results
@@ -129,7 +129,7 @@ def is_not_finite(error: Exception) -> bool:
 
 
 def _cut(
-    data: CrossingData, trajectory: Trajectory, samples: Samples, passing: CrossingTimes
+    data: CrossingData, trajectory: Spline, samples: Samples, passing: CrossingTimes
 ) -> Cut | None:
     """Return the unbroken samples around the crossing; None if some are missing in it."""
     time_s = samples.start_s + np.arange(_size(samples)) / samples.rate_hz
@@ -161,7 +161,7 @@ def _driving(time_s: Floats, motion: Motion, passing: CrossingTimes) -> slice:
     return slice(int(before.max(initial=-1)) + 1, int(behind.min(initial=time_s.size)))
 
 
-def _trajectory(data: CrossingData, around: Window) -> Trajectory | None:
+def _trajectory(data: CrossingData, around: Window) -> Spline | None:
     # Use no fixes later than those awaited: later ones, present by chance, must not matter.
     near = (data.fixes.time_s > data.stay.entry_s - 10.0) & (data.fixes.time_s <= around.end_s)
     if near.sum() < 2 or data.stay.passage is not Passage.THROUGH:
@@ -181,7 +181,7 @@ def _trajectory(data: CrossingData, around: Window) -> Trajectory | None:
 
 
 def _entry_and_exit(
-    data: CrossingData, trajectory: Trajectory | None, around: Window
+    data: CrossingData, trajectory: Spline | None, around: Window
 ) -> tuple[float, float]:
     """Return entry of the front and exit of the rear axle, by the smooth curve if it has them."""
     stay = data.stay
@@ -209,7 +209,7 @@ def _speed_m_per_s(data: CrossingData, entry_s: float, exit_s: float) -> float:
 def _unusable(
     data: CrossingData,
     method: IdentificationMethod,
-    trajectory: Trajectory | None,
+    trajectory: Spline | None,
     entry_s: float,
     exit_s: float,
 ) -> list[Reason]:
@@ -236,7 +236,7 @@ def _unusable(
     if trajectory is None or outage_s > method.longest_outage_s:
         return [*reasons, Reason.POSITION_OUTAGE]
     times = np.linspace(entry_s, exit_s, 200)
-    speed = data.stay.direction * value_at(trajectory.spline, times, 1)
+    speed = data.stay.direction * value_at(trajectory, times, 1)
     if speed.min() < STANDING_M_PER_S:
         reasons.append(Reason.STOPPED_ON_BRIDGE)
     elif np.median(speed) < SLOWEST_M_PER_S:
