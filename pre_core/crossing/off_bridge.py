@@ -99,10 +99,9 @@ def compared_length_m(problem: PosteriorProblem, y: FloatArray) -> float:
 
 def off_bridge_residuals(problem: PosteriorProblem, y: FloatArray) -> tuple[slice, slice]:
     """Return the slices of filtered residuals before and after the bridge, at y (f,)."""
-    at = points(problem, y[None, :])
     crossing, rows = problem.crossing, problem.rows
-    rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), crossing.direction)
-    travel = (rear if crossing.direction > 0 else crossing.span_m - rear)[crossing.first_row :]
+    rear = rear_axle_samples_m(problem, y)
+    travel = rear if crossing.direction > 0 else crossing.span_m - rear
     on, left = np.searchsorted(travel, [0.0, crossing.span_m])
     count = row_count(rows, crossing.rows)
     # A compliant bearing affects some samples before and after the end.

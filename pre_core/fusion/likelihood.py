@@ -33,6 +33,7 @@ from pre_core.crossing.compliances import (
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.mismatch import TRACK_SHAPES, long_wave_power
 from pre_core.crossing.nuisances import ResidualParts, nuisances_of
+from pre_core.crossing.off_bridge import rear_axle_samples_m
 from pre_core.crossing.preparation import replace_mismatch
 from pre_core.crossing.response_surface import response_surface
 from pre_core.crossing.surface_posterior import curved_coordinates, surface_points
@@ -44,7 +45,6 @@ from pre_core.fusion.long_waves import (
     covariance_of_all,
     knots_of,
     off_bridge_mismatch,
-    rear_m,
     short_wave_part,
     white_knots,
 )
@@ -253,8 +253,7 @@ def add_covariance(
 
 
 def _response_to_short_waves(found: Optimum) -> ShortWaveResponse:
-    at = posterior.points(found.problem, found.state.y[None, :])
-    return short_wave_response(found, rear_m(found.problem.crossing, at))
+    return short_wave_response(found, rear_axle_samples_m(found.problem, found.state.y))
 
 
 def _as_root(precision: FloatArray, linear: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from pre_core.arrays import FloatArray
 from pre_core.crossing import posterior
-from pre_core.crossing.arguments import EvaluationPoints, GriddedCrossing
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.mismatch import (
     CORRELATION_LENGTH_M,
@@ -19,13 +18,12 @@ from pre_core.crossing.mismatch import (
     has_alike_tyres,
     long_wave_power,
 )
-from pre_core.crossing.off_bridge import off_bridge_residuals
+from pre_core.crossing.off_bridge import off_bridge_residuals, rear_axle_samples_m
 from pre_core.crossing.residuals import evaluate
 from pre_core.crossing.rows import RESIDUALS, filter_rows, row_count
 from pre_core.crossing.splines import basis
 from pre_core.crossing.whitening import project_out_noise, solve
 from pre_core.fusion.short_waves import BESIDE_M
-from pre_core.physics.simulate import rear_position_m
 
 KNOT_M, ALIKE_KNOT_M = 1.25, 0.5
 """Spacing of the cubic splines' knots, for different and for equal footprints."""
@@ -98,8 +96,7 @@ def knots_of(
 
     The truck is at y (f,).
     """
-    at = posterior.points(problem, y[None, :])
-    rear = rear_m(problem.crossing, at)
+    rear = rear_axle_samples_m(problem, y)
     # Counted from the bridge's start, so that all crossings have the same places.
     knot_m = knot_spacing_m(problem.mismatch)
     first = int(np.floor(rear.min() / knot_m)) - 2
@@ -138,9 +135,7 @@ def white_knots(problem: posterior.PosteriorProblem, y: FloatArray, grid: FloatA
 
     The truck is at y (f,); `grid` (q,) are the knots.
     """
-    crossing, rows = problem.crossing, problem.rows
-    at = posterior.points(problem, y[None, :])
-    rear = rear_m(crossing, at)
+    rows, rear = problem.rows, rear_axle_samples_m(problem, y)
     aside = float(grid[1] - grid[0]) * np.arange(1, _CUBIC)
     padded = np.concatenate([grid[0] - aside[::-1], grid, grid[-1] + aside])
     shape = 1e-3 * basis(padded, _CUBIC, rear)
@@ -160,9 +155,8 @@ def off_bridge_mismatch(found: Optimum) -> OffBridgeMismatch:
     """Return the mismatch off the bridge, at places that all crossings share."""
     problem, y = found.problem, found.state.y
     crossing, rows = problem.crossing, problem.rows
-    at = posterior.points(problem, y[None, :])
-    rear = rear_m(crossing, at)
-    (residual,) = evaluate(crossing, problem.works, at)
+    rear = rear_axle_samples_m(problem, y)
+    (residual,) = evaluate(crossing, problem.works, posterior.points(problem, y[None, :]))
     step = OFF_BRIDGE_STEP_M
     first = int(np.ceil(max(rear.min(), -_FARTHEST_OFF_M) / step))
     last = int(np.floor(min(rear.max(), crossing.span_m + _FARTHEST_OFF_M) / step))
@@ -177,9 +171,3 @@ def off_bridge_mismatch(found: Optimum) -> OffBridgeMismatch:
         inside = (x > place.min()) & (x < place.max())
         out[inside] = np.interp(x[inside], place[order], value[order])
     return OffBridgeMismatch(float(x[0]), out * np.sqrt(long_wave_power(problem.mismatch)))
-
-
-def rear_m(crossing: GriddedCrossing, at: EvaluationPoints) -> FloatArray:
-    """Return the chainage of the rear axle at every residual's sample: (rows,)."""
-    rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), crossing.direction)
-    return rear[crossing.first_row :]
