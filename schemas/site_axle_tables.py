@@ -8,6 +8,14 @@ from schemas.site_numbers import NotNegative, Number, Positive, Spread, Table, T
 
 MAX_AXLES: Final = 20
 _LOAD_SPREAD: Final = 0.02
+MECHANICAL: Final = (
+    "unsprung_mass_kg",
+    "suspension_stiffness_n_per_m",
+    "suspension_damping_ns_per_m",
+    "tyre_stiffness_n_per_m",
+    "tyre_damping_ns_per_m",
+)
+"""Keys of an axle that add up over axles, and that [vehicle] has as pairs."""
 
 
 class Tyres(NamedTuple):

@@ -8,7 +8,7 @@ pairs are those of the front axle and of both others together. Other trucks are 
 import math
 from typing import Any, Final
 
-from schemas.site_axle_tables import TYRES, Axle, Axles
+from schemas.site_axle_tables import MECHANICAL, TYRES, Axle, Axles
 from schemas.site_errors import error_at
 from schemas.site_numbers import UNSPRUNG_MASS_SPREAD
 from schemas.site_tandem import joined, tandem_of
@@ -31,14 +31,6 @@ REPLACED: Final = {
     "twin_tyre_distance_m": "twin_tyre_distance_m",
     "rear_axle_offset_m": "lateral_offset_m",
 }
-_ALIKE: Final = (
-    "unsprung_mass_kg",
-    "suspension_stiffness_n_per_m",
-    "suspension_damping_ns_per_m",
-    "tyre_stiffness_n_per_m",
-    "tyre_damping_ns_per_m",
-)
-"""Keys of an axle whose values become pairs under the same key."""
 
 
 def in_pairs(table: Any) -> Any:
@@ -70,7 +62,7 @@ def in_pairs(table: Any) -> Any:
     else:
         front, rear = known.axles
     rest = {key: value for key, value in table.items() if key not in ("axles", "bogies")}
-    pairs: dict[str, Any] = {key: (getattr(front, key), getattr(rear, key)) for key in _ALIKE}
+    pairs: dict[str, Any] = {key: (getattr(front, key), getattr(rear, key)) for key in MECHANICAL}
     pairs["wheelbase_m"] = rear.position_m
     pairs |= _tyres(front, rear)
     if front.track_m is not None or rear.track_m is not None:

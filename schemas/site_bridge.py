@@ -11,7 +11,7 @@ from schemas.site_damping import Damping, with_coefficients
 from schemas.site_errors import error_at
 from schemas.site_lane import Lane
 from schemas.site_numbers import NotNegative, Number, Positive, Spread
-from schemas.site_physics import check
+from schemas.site_physics import G_M_PER_S2, check
 from schemas.site_vehicle import WithSpreads
 from schemas.wgs84 import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
 
@@ -24,7 +24,6 @@ _SMALLEST_SLIP: Final = 1e-3
 """Tolerance of the sum of rounded element lengths, relative to the span."""
 
 _BEARING_COMPLIANCE_M_PER_N: Final = 1e-9
-_G_M_PER_S2: Final = 9.80665
 _MASS_PER_LENGTH_KG_PER_M: Final = (0.01, 1e6)
 _WAVE_SPEED_M_PER_S: Final = 6000.0
 """Largest wave speed of bridge materials: 5100 in steel, 4000 in concrete."""
@@ -361,5 +360,5 @@ def _first_hz(span_m: float, mass_kg_per_m: float, rigidity_nm2: float) -> float
 
 def _rigidities(span_m: float, mass_kg_per_m: float) -> tuple[float, float]:
     """Return the EI at which a beam sags by a tenth of its span, and EI of the stiffest section."""
-    least = 5.0 * mass_kg_per_m * _G_M_PER_S2 * span_m**3 / (384.0 * _SAG)
+    least = 5.0 * mass_kg_per_m * G_M_PER_S2 * span_m**3 / (384.0 * _SAG)
     return least, mass_kg_per_m * (_WAVE_SPEED_M_PER_S * _GYRATION * span_m) ** 2

@@ -15,10 +15,9 @@ import math
 from abc import abstractmethod
 from typing import Annotated, Final
 
-from pydantic import BaseModel, Field, Strict
+from pydantic import BaseModel, Field
 
-Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
-Spread = Annotated[Number, Field(ge=0, le=3)]
+from schemas.site_numbers import Number, Spread
 
 USUAL_LANE_M: Final = 2.0
 """Distance of a usual lane from the axis: half of a two-lane road."""

@@ -9,6 +9,7 @@ from typing import Final
 
 from schemas.site_errors import error_at
 
+G_M_PER_S2: Final = 9.80665
 _SLIPS: Final[dict[str, dict[str, float]]] = {
     "N/m": {"kN/m": 1e3},
     "N·s/m": {"kN·s/m": 1e3},

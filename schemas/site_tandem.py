@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from schemas.site_axle_tables import Axle, Bogie
+from schemas.site_axle_tables import MECHANICAL, Axle, Bogie
 from schemas.site_errors import error_at
 
 AXLES: Final = 3
@@ -111,14 +111,7 @@ def joined(tandem: Tandem) -> Axle:
     """Return the axle in place of both: at their common force, with the sums of their values."""
     first, second = tandem.axles
     together: dict[str, float] = {
-        key: getattr(first, key) + getattr(second, key)
-        for key in (
-            "unsprung_mass_kg",
-            "suspension_stiffness_n_per_m",
-            "suspension_damping_ns_per_m",
-            "tyre_stiffness_n_per_m",
-            "tyre_damping_ns_per_m",
-        )
+        key: getattr(first, key) + getattr(second, key) for key in MECHANICAL
     }
     load: float | None = None
     spread = first.load_kg_spread

@@ -14,8 +14,8 @@ from schemas.site import Bridge, Sensor, Site, Vehicle
 from schemas.site_damping import rayleigh_of
 from schemas.site_frequency import first_frequency_hz, given_frequencies
 from schemas.site_implied import MAX_BRIDGES, ImpliedQuantity
+from schemas.site_physics import G_M_PER_S2
 
-_G_M_PER_S2: Final = 9.80665
 _FIRST_HZ: Final = (0.25, 4.0)
 """First natural frequency relative to 100 Hz/L, L in m: a rule of thumb for road bridges."""
 _DAMPING: Final = (0.002, 0.15)
@@ -204,7 +204,7 @@ def of_sensors(sensor: Sensor, vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     """Yield the noise densities that are unusual; 0 is a simulation without noise."""
     declared = tuple(one.noise_density_ug_per_rthz for one in vehicle.sensors)
     for density in dict.fromkeys(declared or sensor.noise_density_ug_per_rthz):
-        units = (("mg/√Hz", 1e3), ("ng/√Hz", 1e-3), ("m/s²/√Hz", 1e6 / _G_M_PER_S2))
+        units = (("mg/√Hz", 1e3), ("ng/√Hz", 1e-3), ("m/s²/√Hz", 1e6 / G_M_PER_S2))
         slips = (Slip("noise_density_ug_per_rthz", density, _power(density, 1.0), units),)
         text = f"{vehicle.id}: noise {density:.3g} µg/√Hz"
         found = _implied("noise_usual", text, density, _NOISE_UG, "µg/√Hz", slips)
@@ -234,7 +234,7 @@ def of_bridge(bridge: Bridge, vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     yield _damping(bridge, first_hz)
     yield from _odd(_idle_alpha(bridge, first_hz))
     yield from _odd(_elements(bridge))
-    weight = vehicle.total_mass_kg * _G_M_PER_S2
+    weight = vehicle.total_mass_kg * G_M_PER_S2
     deflection = weight * span**3 / (48.0 * rigidity)
     slips = (Slip(key, rigidity, _power(deflection / span, -1.0), _RIGIDITY),)
     text = (
