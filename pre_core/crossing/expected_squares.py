@@ -15,11 +15,7 @@ from numpy.typing import NDArray
 
 from pre_core.arrays import FloatArray
 from pre_core.crossing.channels import GainsAndDelays
-from pre_core.crossing.errors_in_variables import (
-    ComparedStretch,
-    channel_factors,
-    mismatch_weights,
-)
+from pre_core.crossing.errors_in_variables import ComparedStretch, channel_factors, mismatch_weights
 from pre_core.crossing.layout import CHANNELS
 from pre_core.crossing.noise import (
     AliasedBands,

@@ -14,12 +14,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from pre_core.arrays import FloatArray
-from pre_core.crossing.nuisances import (
-    Nuisances,
-    integrated_residuals,
-    unexplained,
-    with_mixture,
-)
+from pre_core.crossing.nuisances import Nuisances, integrated_residuals, unexplained, with_mixture
 
 POINTS, POINTS_OF_DRAWS = 1920, 960
 """Numbers of points to which a surface is fitted: for fusion (fourteen for each of its

@@ -19,11 +19,7 @@ from pre_core.crossing.fit import (
     resting_mode_indices,
     tempered_residuals,
 )
-from pre_core.crossing.posterior import (
-    PosteriorProblem,
-    has_tandem,
-    layout,
-)
+from pre_core.crossing.posterior import PosteriorProblem, has_tandem, layout
 from pre_core.search import levenberg_marquardt
 from pre_core.search.levenberg_marquardt import minimise
 

@@ -18,13 +18,8 @@ from pre_core.fusion.lateral_wander import (
     shared_fraction,
     wander_posterior,
 )
-from pre_core.fusion.likelihood import (
-    CrossingLikelihood,
-)
-from pre_core.fusion.long_waves import (
-    covariance_of_coefficients,
-    long_share,
-)
+from pre_core.fusion.likelihood import CrossingLikelihood
+from pre_core.fusion.long_waves import covariance_of_coefficients, long_share
 from pre_core.fusion.short_waves import shared_error_roots
 from pre_core.physics.road import Profile
 from pre_core.physics.surface import Footprint

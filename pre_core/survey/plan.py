@@ -23,14 +23,8 @@ from pre_core.crossing import posterior
 from pre_core.crossing.compliances import draws, from_normal, marginal
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.mismatch import Mismatch, between_run_spectra
-from pre_core.fusion.likelihood import (
-    CrossingLikelihood,
-    add_covariance,
-    likelihood,
-)
-from pre_core.fusion.long_waves import (
-    covariance_of_coefficients,
-)
+from pre_core.fusion.likelihood import CrossingLikelihood, add_covariance, likelihood
+from pre_core.fusion.long_waves import covariance_of_coefficients
 from pre_core.fusion.path_groups import low_rank_root
 from pre_core.search import levenberg_marquardt
 from pre_core.search.loop import Termination
