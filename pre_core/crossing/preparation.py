@@ -225,7 +225,7 @@ def update_noise(
 ) -> PosteriorProblem:
     """Return the problem with noise and modal coordinates for truck and bridge at y (f,).
 
-    The work arrays are shared with the given problem, which needs another update after this one.
+    The work arrays are shared with the given problem; the modes that they hold are discarded.
 
     The suspension noise is `force` (2, shapes), by default that of the body equations at y if it is
     at least `friction_statistic` (`suspension_noise_levels`). Mismatch levels are `mismatch` (s,),

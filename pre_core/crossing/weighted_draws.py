@@ -24,7 +24,7 @@ _MAX_POINTS = 100
 
 
 class WantedDraws(NamedTuple):
-    """The requested number of draws, and the number of batches that must show enough progress."""
+    """The requested number of draws, and the number of batches after which too slow draws end."""
 
     number: int
     patience: int = _MAX_BATCHES
