@@ -104,7 +104,7 @@ def _best_bridge(
 
 
 def _at_full_weight(found: Optimum, y: FloatArray) -> Optimum:
-    """Return an optimum displaced to y (size,), with full weight of the body equations."""
+    """Return an optimum displaced to y (f,), with full weight of the body equations."""
     problem = update_noise(found.problem, y, no_suspension_noise())
     return found._replace(
         problem=problem,
@@ -146,7 +146,7 @@ def _likeliest(others: list[OtherBridge]) -> list[OtherBridge]:
 def _fitted(
     around: Optimum, y: FloatArray, strategy: SearchStrategy, completed_to: float = np.inf
 ) -> tuple[Optimum | None, int]:
-    """Return the fit of all parameters from y (size,), if there is one, and evaluations.
+    """Return the fit of all parameters from y (f,), if there is one, and evaluations.
 
     It is completed up to a chi2 of `completed_to`.
     """
