@@ -18,7 +18,7 @@ from schemas.settings import NOT_OF_THE_RESULT, IdentificationSettings
 from schemas.site import Site
 from schemas.strict_model import Finite, StrictModel
 
-METHOD_EDITION: Final = 13
+METHOD_EDITION: Final = 14
 """Version of the results of method `pre`. Raise it with every change that may alter a result;
 earlier validation records become void. It is independent of the program's version, because most
 versions leave the method unchanged and it may change between two versions."""

@@ -23,6 +23,7 @@ from pre_core.crossing.rows import RESIDUALS, RowFilter
 from pre_core.crossing.step_tables import PHASES as _PHASES
 from pre_core.crossing.step_tables import SINC_TAPS as _SINC_TAPS
 from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_SPRING_N_PER_M
+from pre_core.crossing.tyre_damping import add_tyre_damping
 from pre_core.crossing.whitening import Whitener, project_out_noise, whiten_into
 from pre_core.kernels.lanes import inner, kernel, summing
 from pre_core.parameters import C_S1, C_U1, D_1, K_S1, K_U1, KAPPA, M_U1
@@ -88,9 +89,6 @@ def _wheels(
         m_ii = m_11 if w == 0 else m_22
         m_u = theta[M_U1 + w]
         c, k, k_u = theta[C_S1 + w], theta[K_S1 + w], theta[K_U1 + w]
-        # delta = (F - tau F' + tau^2 F'')/k_u solves k_u delta + c_u delta' = F for small tau.
-        tau = theta[C_U1 + w] / k_u
-        slope, bend = tau / (12.0 * step), (tau / step) ** 2
         weight = gravity * crossing.gravity_m_per_s2 * on_axles[w]
         z_s, v_s, a_s = work.corrected[w, 0], work.corrected[w, 1], work.corrected[w, 2]
         z_u, v_u, a_u = work.corrected[2 + w, 0], work.corrected[2 + w, 1], work.corrected[2 + w, 2]
@@ -112,8 +110,7 @@ def _wheels(
                 force[i] = m_u * a_u[i] + c * (v_u[i] - v_s[i]) + k * (z_u[i] - z_s[i])
         for i in range(n):
             road[i] = -z_u[i] - force[i] * soft
-        if tau != 0.0:
-            tandem.add_tyre_damping(force, slope, bend, soft, road)
+        add_tyre_damping(force, theta[C_U1 + w] / k_u / step, soft, road)
         for i in range(n):
             spring = c * (v_u[i] - v_s[i]) + k * (z_u[i] - z_s[i])
             inertial = m_ii * a_s[i] + m_12 * a_other[i]

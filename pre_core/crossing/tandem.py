@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pre_core.arrays import FloatArray
 from pre_core.crossing.arguments import Buffers, GriddedCrossing
 from pre_core.crossing.suspension_noise import REDUCED_WEIGHT_SPRING_N_PER_M
+from pre_core.crossing.tyre_damping import add_tyre_damping
 from pre_core.kernels.lanes import Lanes, fma, fma_scalar, inner, kernel, load, mul, store
 from pre_core.parameters import C_S1, C_U1, K_S1, K_U1, M_U1, SHARE
 from pre_core.physics.tandem import Lead, lead_response, own_springs, shared_load
@@ -39,26 +40,6 @@ def are_parts_equal(part: NDArray[np.int64], i: int, j: int) -> bool:
     for w in range(part.shape[0]):
         equal = equal and part[w, i] == part[w, j]
     return equal
-
-
-@inner
-def add_tyre_damping(
-    force: FloatArray, slope: float, bend: float, soft: float, road: FloatArray
-) -> None:
-    """Add to `road` (n,), the negative profile, the part of a tyre's deflection due to damping.
-
-    k_u delta + c_u delta' = F is solved by delta = (F - tau F' + tau² F'')/k_u for small tau =
-    c_u/k_u; `slope` is tau/(12 step), `bend` (tau/step)², `soft` 1/k_u.
-    """
-    n = force.size
-    for i in range(2, n - 2):
-        rate = 8.0 * (force[i + 1] - force[i - 1]) - (force[i + 2] - force[i - 2])
-        second = force[i + 1] - 2.0 * force[i] + force[i - 1]
-        road[i] += (slope * rate - bend * second) * soft
-    for i in range(2):
-        road[i] += slope * soft * 12.0 * (force[i + 1] - force[i])
-        last = n - 1 - i
-        road[last] += slope * soft * 12.0 * (force[last] - force[last - 1])
 
 
 @inner
@@ -96,7 +77,6 @@ def wheels(
     for w in range(2):
         share = theta[SHARE] if w == 0 else 1.0 - theta[SHARE]
         m_u, k_u = theta[M_U1 + w], theta[K_U1 + w]
-        tau = theta[C_U1 + w] / k_u
         z_u, a_u = work.corrected[2 + w, 0], work.corrected[2 + w, 2]
         static = weight * (share * on.bogie_kg + m_u)
         road, of_wheel, force = work.road[w], work.load[w], work.sharp[w]
@@ -107,9 +87,7 @@ def wheels(
             of_wheel[i] = -static - force[i]
         for i in range(n):
             road[i] = -z_u[i] - force[i] * soft
-        if tau != 0.0:
-            slope = tau / (12.0 * crossing.step_s)
-            add_tyre_damping(force, slope, (tau / crossing.step_s) ** 2, soft, road)
+        add_tyre_damping(force, theta[C_U1 + w] / k_u / crossing.step_s, soft, road)
 
 
 @inner

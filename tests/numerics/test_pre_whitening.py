@@ -80,8 +80,8 @@ def plain_residuals(signals: FloatArray, step_s: float, *, is_inertial: bool = T
         m_u, k_u = car.unsprung_mass_kg[w], car.tyre_stiffness_n_per_m[w]
         then = signals[:, :, w * later : w * later + n]
         sprung, unsprung, other = then[w], then[2 + w], then[1 - w]
-        # The tyre's force moves everything above it: F = k_u d + c_u d', solved for d. What is
-        # left out of the series is (c_u s/k_u)^3, 0.4 % at 42 Hz.
+        # The tyre's force moves everything above it: F = k_u d + c_u d', solved for d by a series.
+        # What is left out is (c_u s/k_u)^3, 0.4 % at 42 Hz.
         pull, *more = (
             c * (sprung[rate] - unsprung[rate]) + k * (sprung[order] - unsprung[order])
             for order, rate in ((Z, V), (V, A), (A, A_1))
