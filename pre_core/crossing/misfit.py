@@ -19,7 +19,7 @@ body equations and one profile it was 25 or more where springs or profiles of fa
 crossings needed another model."""
 _MAX_REPEATS, _CLEARLY_LESS = 4, 0.8
 """Limit of repeated fits, and the chi2 relative to the last one that another fit must reach."""
-_MAX_REPEATED_CHI2 = 10.0
+_MAX_REPEATED_CHI2 = 500.0
 """Value of `OffBridgeFit.chi2` above which the noise of another truck explains nothing."""
 _STEPS, _IMPROVEMENT = 12, 10.0
 """Limit of steps, and the improvement of the sum of squares that ends the fit, whose chi2 is judged
@@ -39,15 +39,29 @@ def fit_off_bridge(found: Optimum) -> OffBridgeFit:
     """Return the fit of truck and trajectory to the residuals off the bridge, from an optimum.
 
     The truck of a wrong bridge is a wrong one, and so is the noise that it transmits: the fit is
-    repeated with the noise of its own truck as long as this explains clearly more.
+    repeated with the noise of its own truck as long as this explains clearly more, and from the
+    nominal truck if it explains too little.
     """
     problem = found.problem
-    best = _fit_once(problem, found.state.y)
+    best = _fit_with_own_noise(problem, found.state.y)
+    if best.chi2 <= EXPLAINED_CHI2 or not np.isfinite(best.chi2):
+        return best
+    nominal = np.zeros_like(found.state.y)
+    trajectory = layout(problem).trajectory
+    nominal[trajectory] = found.state.y[trajectory]
+    other = _fit_with_own_noise(update_noise(problem, nominal, problem.force), nominal)
+    evaluations = best.evaluations + other.evaluations
+    return min(best, other, key=lambda fit: fit.chi2)._replace(evaluations=evaluations)
+
+
+def _fit_with_own_noise(problem: PosteriorProblem, y: FloatArray) -> OffBridgeFit:
+    """Return the fit from y (f,), repeated with the noise of its own truck."""
+    best = _fit_once(problem, y)
     evaluations = best.evaluations
     for _ in range(_MAX_REPEATS):
         if not EXPLAINED_CHI2 < best.chi2 <= _MAX_REPEATED_CHI2:
             break
-        problem = update_noise(problem, best.y, found.problem.force)
+        problem = update_noise(problem, best.y, problem.force)
         again = _fit_once(problem, best.y)
         evaluations += again.evaluations
         if again.chi2 > _CLEARLY_LESS * best.chi2:

@@ -79,9 +79,8 @@ chi2 to a usable one."""
 _MAX_EVALUATIONS = 100_000
 """Limit of a whole search. The sample takes 2,000, a site file with two supports too many 65,000:
 beyond this a search has failed, and its numbers are not reliable."""
-_MAX_ABOUT_TRUCK = 20_000
-"""Limit of evaluations for other bridges about a truck: of 26 drawn crossings of a plain bridge of
-24 m, seven of which had ended at a wrong one, all took 4,000 to 23,000 to the right one."""
+_MAX_ABOUT_TRUCK = 16_000
+"""Limit of evaluations for other bridges about a truck, five times those of a plain crossing."""
 _WRONG_BRIDGE_CHI2 = 50.0
 """Value of chi2 above which no other bridge is tried about a truck: where the search had ended at
 another frequency it was 1.5 to 25, with a vehicle following up to 1,900."""

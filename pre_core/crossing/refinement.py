@@ -1,5 +1,7 @@
 """Refinement of an optimum: starts from other offsets, bearings and bridges."""
 
+from itertools import product
+
 import numpy as np
 
 from pre_core.arrays import FloatArray
@@ -24,7 +26,7 @@ from pre_core.crossing.mismatch import has_alike_tyres
 from pre_core.crossing.noise import no_suspension_noise
 from pre_core.crossing.posterior import has_tandem, layout
 from pre_core.crossing.preparation import update_noise
-from pre_core.crossing.walk import better_neighbour, scan_offsets, shifted_to
+from pre_core.crossing.walk import better_neighbour, shifted_to
 from pre_core.search.loop import Termination
 
 _CLEAR_RESTRAINT = 0.5
@@ -38,9 +40,13 @@ _KEPT_RIVALS = 4
 """Limit of other bridges near which the posterior is drawn, too."""
 _FAILED_ROUNDS = 2
 """Rounds without a better bridge, ends alike and one at a time, after which no other is tried."""
-_COMPLETED_CHI2 = 60.0
-"""Value of chi2 up to which fits from other bridges about a truck are completed: with the true
-truck one at 46 led to the true bridge."""
+_SHIFTS_M = (0.0, -1.2, 1.2)
+"""Offsets from which other bridges are tried about a truck: from more than half a metre off, their
+fits may end at a wrong one."""
+_COMPLETED_CHI2, _HOPELESS_START_CHI2 = 12.0, 100.0
+"""Values of chi2 after a few steps up to which fits from other bridges about a truck are completed,
+and above which no other one is tried. Of five crossings four had 1 to 10 at the true offset and 1
+to 22 at the first one tried; with a skew plate it was 4,500."""
 
 
 def refined(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> tuple[Optimum, int]:
@@ -57,50 +63,51 @@ def about_truck(
 
     The truck explains the residuals off the bridge, where no bridge acts, so a misfit of `found`
     may be due to a bridge that vibrates at another frequency. Bridges of other frequencies are
-    tried about this truck and, if none of them is accepted, about the likeliest offset of a bridge
-    under it. None if no fit from a bridge about this truck was worth completing.
+    tried about this truck from several offsets, up to an accepted one, then about the best of them.
+    None if no fit was worth completing.
     """
-    truck = _at_full_weight(found, y)
-    best, evaluations = _best_bridge(truck, None, strategy, max_evaluations)
-    if best is None or is_accepted(best.problem, best.chi2_per_dof):
-        return best, evaluations
-    if evaluations > max_evaluations:
-        return best, evaluations
-    places, used = scan_offsets(truck.problem, y, strategy)
-    evaluations += used
-    if not places:
-        return best, evaluations
-    start = shifted_to(truck.problem, y, places[0])
-    at_offset, used = _fitted(truck, start, strategy, _COMPLETED_CHI2)
-    evaluations += used
-    if at_offset is not None and at_offset.unfinished is None:
-        around = _at_full_weight(at_offset, at_offset.state.y)
-        other, used = _best_bridge(around, at_offset, strategy, max_evaluations - evaluations)
+    best: Optimum | None = None
+    evaluations = 0
+    for is_even, shift_m in product((True, False), _SHIFTS_M):
+        moved = y.copy()
+        moved[layout(found.problem).trajectory] += shift_m
+        fits, used = _fits_about(_at_full_weight(found, moved), strategy, 1, is_even=is_even)
         evaluations += used
-        best = min(best, other or best, key=lambda one: one.chi2_per_dof)
-    return best, evaluations
+        best = min(
+            [*fits, *([] if best is None else [best])], key=_chi2_at_full_weight, default=None
+        )
+        if best is None or best.chi2_per_dof > _HOPELESS_START_CHI2:
+            break
+        if _is_fit(best) or evaluations > max_evaluations:
+            break
+    if best is None or best.unfinished is not None:
+        return None, evaluations
+    best, used = _best_bridge(best, strategy, max_evaluations - evaluations)
+    return best, evaluations + used
 
 
 def _best_bridge(
-    around: Optimum, best: Optimum | None, strategy: SearchStrategy, max_evaluations: int
-) -> tuple[Optimum | None, int]:
-    """Return the best of `best` and optima of other bridges about `around`, and the evaluations.
+    best: Optimum, strategy: SearchStrategy, max_evaluations: int
+) -> tuple[Optimum, int]:
+    """Return the best of `best` and optima of other bridges about it, and the evaluations.
 
     They are tried again about each better one: the bridge next to a wrong one may be the true one.
     """
-    evaluations, failed, is_even = 0, 0, True
+    around = _at_full_weight(best, best.state.y)
+    evaluations, failed, is_even = 0, 0, False
     while failed < _FAILED_ROUNDS and evaluations <= max_evaluations:
-        others, used = other_bridges(around, strategy, is_even=is_even)
-        fits, used_by_fits = _fits(around, others, strategy)
-        evaluations += used + used_by_fits
+        fits, used = _fits_about(around, strategy, _TRIED_BRIDGES, is_even=is_even)
+        evaluations += used
         failed, is_even = failed + 1, not is_even
         for fit in fits:
             here = _at_full_weight(fit, fit.state.y)
-            if best is None or is_better(here, around):
+            if is_better(here, around):
                 best, around, failed = fit, here, 0
-        if best is None:
-            break
     return best, evaluations
+
+
+def _is_fit(found: Optimum) -> bool:
+    return is_accepted(found.problem, found.chi2_per_dof)
 
 
 def _at_full_weight(found: Optimum, y: FloatArray) -> Optimum:
@@ -113,27 +120,31 @@ def _at_full_weight(found: Optimum, y: FloatArray) -> Optimum:
     )
 
 
-def _fits(
-    around: Optimum, others: list[OtherBridge], strategy: SearchStrategy
-) -> tuple[list[Optimum], int]:
-    """Return the completed fits from the likeliest other bridges, and the evaluations.
+def _chi2_at_full_weight(found: Optimum) -> float:
+    return _at_full_weight(found, found.state.y).chi2_per_dof
 
-    An accepted one is the last.
+
+def _fits_about(
+    around: Optimum, strategy: SearchStrategy, tried: int, *, is_even: bool
+) -> tuple[list[Optimum], int]:
+    """Return fits of all parameters from `tried` other bridges at most, and the evaluations.
+
+    They are completed up to `_COMPLETED_CHI2`; an accepted one is the last.
     """
+    others, evaluations = other_bridges(around, strategy, is_even=is_even)
     fits: list[Optimum] = []
-    evaluations = 0
-    for other in _likeliest(others):
+    for other in _likeliest(others)[:tried]:
         fitted, used = _fitted(around, other.y, strategy, _COMPLETED_CHI2)
         evaluations += used
-        if fitted is None or fitted.unfinished is not None:
+        if fitted is None:
             continue
-        if fitted.chi2_per_dof <= HOPELESS_CHI2 and fitted.ending is not Termination.CONVERGED:
+        if fitted.unfinished is None and fitted.ending is not Termination.CONVERGED:
             # A bridge far from the first one may need more steps than a fit takes.
             again, used = fit_all(fitted.problem, fitted.state.y, strategy)
             evaluations += used
             fitted = fitted if again is None else again
         fits.append(fitted)
-        if is_accepted(fitted.problem, fitted.chi2_per_dof):
+        if _is_fit(fitted):
             break
     return fits, evaluations
 

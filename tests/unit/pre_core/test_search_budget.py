@@ -392,12 +392,15 @@ def test_without_a_fit_the_best_poor_start_is_completed(
     [
         # The first bridge about the truck is accepted, and no other is better.
         ((1.0, 3.0, 3.0, 3.0, 3.0), 1.0, 3),
-        # The second of the first set is better, and leads to an accepted one.
-        ((6.0, 3.0, 1.0, 2.0, 2.0, 2.0, 2.0), 1.0, 4),
+        # From the third offset one is accepted.
+        ((6.0, 3.0, 1.0, 2.0, 2.0, 2.0, 2.0), 1.0, 5),
         # An accepted bridge leads to a better one.
         ((1.2, 1.0, 1.1, 1.1), 1.0, 4),
-        # Fits that are not worth completing end the search.
-        ((61.0, 70.0), None, 1),
+        # None is accepted, and others are tried about the best.
+        ((6.0, 5.0, 4.0, 5.0, 6.0, 7.0, 4.0, 3.0, 3.0, 3.0, 3.0, 3.0), 3.0, 9),
+        # Fits that are not worth completing, and one that is hopeless.
+        ((61.0, 70.0, 20.0, 30.0, 40.0, 50.0), None, 6),
+        ((101.0,), None, 1),
     ],
 )
 def test_other_bridges_about_a_truck_are_tried_as_long_as_they_fit_better(
@@ -408,45 +411,38 @@ def test_other_bridges_about_a_truck_are_tried_as_long_as_they_fit_better(
     first = found(5.0, 1)._replace(state=SimpleNamespace(y=np.zeros(1), _replace=moved))
     other, used = refinement.about_truck(first, np.full(1, 7.0), STRATEGY, 1000)
     assert (other.chi2_per_dof if other else None) == best
-    assert about[0] == ([7.0], True)
-    assert [is_even for _, is_even in about] == [True, False, True, False][:sets]
+    offsets = [(7.0, True), (5.8, True), (8.2, True), (7.0, False), (5.8, False), (8.2, False)]
+    scanned = [one for one in about if one[0] > 1.0]
+    assert scanned == offsets[: len(scanned)]
+    assert [is_even for at, is_even in about if at <= 1.0] == [False, True, False, True][
+        : sets - len(scanned)
+    ]
+    assert len(about) == sets
     assert used == 10 * sets + len(chi2)
     assert not list(fits)
 
 
-def test_bridge_at_another_offset_is_fitted_where_none_about_the_truck_is_accepted(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    reached = iter((3.0, 3.0, *(3.0, 3.0) * 2, 2.0, 1.0, *(1.0,) * 2))
-    about = tried_bridges(reached, monkeypatch)
+def test_bridges_are_tried_until_all_evaluations_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    about = tried_bridges(iter((6.0, 5.0)), monkeypatch)
     first = found(5.0, 1)._replace(state=SimpleNamespace(y=np.zeros(1), _replace=moved))
-    other, used = refinement.about_truck(first, np.full(1, 7.0), STRATEGY, 1000)
+    other, used = refinement.about_truck(first, np.full(1, 7.0), STRATEGY, 21)
     assert other is not None
-    assert other.chi2_per_dof == 1.0
-    assert len(about) == 6
-    assert not list(reached)
-    assert used == 10 * len(about) + 10 + 500
-    # No offset is scanned where all evaluations were used.
-    reached = iter((3.0,) * 2)
-    about = tried_bridges(reached, monkeypatch)
-    other, used = refinement.about_truck(first, np.full(1, 7.0), STRATEGY, 11)
-    assert other is not None
-    assert (other.chi2_per_dof, used) == (3.0, 12)
+    assert (other.chi2_per_dof, used, len(about)) == (5.0, 22, 2)
 
 
 def tried_bridges(
     reached: Iterator[float], monkeypatch: pytest.MonkeyPatch
-) -> list[tuple[list[float], bool]]:
+) -> list[tuple[float, bool]]:
     """Replace fits by ones that reach these chi2; return the list of where bridges are tried."""
     about = []
 
     def others(one: Any, _: Any, *, is_even: bool) -> tuple[list[Any], int]:
-        about.append((one.state.y.tolist(), is_even))
+        about.append((float(one.state.y[0]), is_even))
         return [SimpleNamespace(y=np.ones(1), gain=gain) for gain in (9.0, 8.0, 7.0, -1.0)], 10
 
     def fitted(*_: Any) -> tuple[Optimum, int]:
         chi2 = next(reached)
-        return found(chi2, 1)._replace(unfinished=STRATEGY if chi2 > 50.0 else None), 1
+        return found(chi2, 1)._replace(unfinished=STRATEGY if chi2 > 12.0 else None), 1
 
     monkeypatch.setattr(refinement, "other_bridges", others)
     monkeypatch.setattr(refinement, "is_accepted", lambda _, value: value < 1.5)
@@ -455,8 +451,7 @@ def tried_bridges(
     )
     monkeypatch.setattr(refinement, "_at_full_weight", lambda one, y: one._replace(state=moved(y)))
     monkeypatch.setattr(refinement, "complete_fit", lambda one: one)
-    monkeypatch.setattr(refinement, "scan_offsets", lambda *_: ([SimpleNamespace()], 500))
-    monkeypatch.setattr(refinement, "shifted_to", lambda *_: np.full(1, 3.0))
+    monkeypatch.setattr(refinement, "layout", lambda _: SimpleNamespace(trajectory=slice(0, 1)))
     monkeypatch.setattr(refinement, "fit_all", fitted)
     return about
 
