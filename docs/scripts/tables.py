@@ -331,7 +331,11 @@ def bridge_reasons() -> str:
 
 def _remedies(old: str) -> str:
     def row(found: re.Match[str]) -> str:
-        return f"| `{found[1]}` | {found[2]} | {ENGLISH.advice[found[1]]} |\n"
+        advice = ENGLISH.advice[found[1]]
+        paper = ENGLISH.remedy(found[1], "least_squares")
+        if paper != advice:
+            advice += f" Methods of the paper: {paper[0].lower()}{paper[1:]}"
+        return f"| `{found[1]}` | {found[2]} | {advice} |\n"
 
     pattern = r"^\| `(\w+)` \| (.+) \|(?: [^|\n]*)\|\n"
     return re.sub(pattern, row, f"{old}\n", flags=re.MULTILINE)

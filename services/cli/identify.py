@@ -318,7 +318,8 @@ def _print_crossing(
         highlight=False,
     )
     console.print(f"verdict [bold]{crossing.verdict}[/]", highlight=False)
-    print_reasons(console, crossing.reasons, crossing.reason_texts, ENGLISH.advice)
+    remedies = {code: ENGLISH.remedy(code, crossing.method) for code in crossing.reasons}
+    print_reasons(console, crossing.reasons, crossing.reason_texts, remedies)
     if crossing.parameters is None:
         return
     bridge = site.bridge(crossing.bridge)

@@ -44,7 +44,7 @@ class Language(NamedTuple):
     details: Mapping[str, str]
     """Parts of the details behind a reason, by the English ones."""
     advice: Mapping[str, str]
-    """Advice for each reason of a crossing; docs/verdicts.md has it in more detail."""
+    """Advice for each reason of a crossing with method `pre`; see `remedy`."""
     bridge_advice: Mapping[str, str]
     glossary: tuple[GlossaryEntry, ...]
 
@@ -84,6 +84,10 @@ class Language(NamedTuple):
         for english, own in self.details.items():
             details = details.replace(english, own)
         return f"{sentence.removesuffix('.')}: {details}"
+
+    def remedy(self, code: str, method: str) -> str:
+        """Return the advice for a reason of a crossing that was identified by a method."""
+        return self.sentences.get(f"remedy.{code}.{method}", self.advice[code])
 
     def bridge_reason(self, code: str, stored: str) -> str:
         """Return the sentence of a reason of a bridge's state."""

@@ -4,14 +4,14 @@ The residuals and diagnostics that `checks` judges are collected here from the o
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from pre_core import parameters
 from pre_core.crossing import posterior, shaking, slip, speeds
 from pre_core.crossing.compliances import MISMATCH_BIAS_SPREAD, mismatch_bias
-from pre_core.crossing.fit import Optimum, normal_approximation
+from pre_core.crossing.fit import FAR_OFF_CHI2, Optimum, normal_approximation
 from pre_core.crossing.misfit import EXPLAINED_CHI2, fit_off_bridge
 from pre_core.crossing.mismatch import pavement_ratio
 from pre_core.crossing.off_bridge import compared_length_m, mismatch_excess, rear_axle_chainage_m
@@ -39,6 +39,12 @@ _CONTRADICTION = 1.2
 estimate from the span or another temperature is within it."""
 _UNEXPLAINED_CHI2 = 3.0
 """Value of chi2 off the bridge, fitted to that alone, from which the truck is not explained."""
+
+FAR_FROM_MEASUREMENT: Final = "it ended at values far from the measurement"
+_ENDINGS: Final[Mapping[Termination, str]] = {
+    Termination.STEPS_EXHAUSTED: "it reached its limit of steps",
+    Termination.STUCK: "no further step improved the fit",
+}
 
 
 class ReasonsOfFit(NamedTuple):
@@ -82,11 +88,24 @@ def reasons_of_fit(
         Reason.MODEL_MISFIT: "; ".join(
             filter(None, (_place_of_misfit(off_bridge_chi2), _wrong_bridge(data, found)))
         ),
+        Reason.NOT_CONVERGED: _ending_of_search(found),
         Reason.NOISE_ABOVE_DECLARED: coarse,
         Reason.IMPLAUSIBLE_VEHICLE: odd_parameters(fit),
         Reason.TANDEM_FRICTION: f"about {100.0 * fit.tandem_friction:.2g} % of their load",
     }
     return ReasonsOfFit((*axles, *reasons), about, bool(slipped) or is_biased_by_mismatch(fit))
+
+
+def _ending_of_search(found: Optimum) -> str:
+    """Return how a search ended that did not converge, in words."""
+    if found.chi2_per_dof > FAR_OFF_CHI2:
+        return FAR_FROM_MEASUREMENT
+    return words_of_ending(found.ending)
+
+
+def words_of_ending(ending: Termination) -> str:
+    """Return how a search ended, in words; "" for an ending that is no failure."""
+    return _ENDINGS.get(ending, "")
 
 
 def _place_of_misfit(off_bridge_chi2: float) -> str:

@@ -5,7 +5,7 @@ Neither has a noise model: no value of theirs is ever `good` (docs/contract.md).
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
 from services.common.arrays import Floats
 from services.finding.crossing_data import CrossingData
+from services.identification.fit_reasons import words_of_ending
 from services.identification.result_parts import (
     CrossingTimes,
     beam_of,
@@ -44,6 +45,8 @@ Without noise a fit leaves 1e-5; from a few thousandths on elements cannot be di
 """
 _LARGEST_FACTOR = 100.0
 """Largest factor between a value and its declaration: nothing differs a hundredfold."""
+
+FAR_FROM_SITE: Final = "it ended at values far from those of the site file"
 
 
 class _Fit(NamedTuple):
@@ -217,7 +220,9 @@ def _result(
     }
     if _has_diverged(data, fit):
         # Under noise the plain residual has no useful minimum: no value is an estimate.
-        return rejected(data, settings, passing, [Reason.NOT_CONVERGED], diagnostics=diagnostics)
+        ending = words_of_ending(fit.ending) or FAR_FROM_SITE
+        about = {Reason.NOT_CONVERGED: ending}
+        return rejected(data, settings, passing, about, about, diagnostics=diagnostics)
     reasons = [Reason.NO_NOISE_MODEL]
     deflection_m = float(residual.deflections_m(window, fit.theta).max())
     diagnostics["misfit_over_deflection"] = misfit_m / max(deflection_m, 1e-12)

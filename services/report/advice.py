@@ -69,8 +69,10 @@ def _other_truck(report: BridgeReport, language: Language) -> Iterator[str]:
 
 def advice(crossings: Iterable[CrossingResult], language: Language) -> list[str]:
     """Return the advice on the reasons of crossings, for the most frequent one first."""
-    counted = Counter(reason for crossing in crossings for reason in crossing.reasons)
-    return list(dict.fromkeys(language.advice[code] for code, _ in counted.most_common()))
+    counted = Counter(
+        (code, crossing.method) for crossing in crossings for code in crossing.reasons
+    )
+    return list(dict.fromkeys(language.remedy(*one) for one, _ in counted.most_common()))
 
 
 def advice_of_state(report: BridgeReport, language: Language) -> list[str]:

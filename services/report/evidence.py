@@ -144,7 +144,7 @@ def _reasons(numbered: Sequence[Numbered], language: Language) -> Iterator[Html]
         sentences = reasons_of(crossing, language)
         for code, sentence in zip(crossing.reasons, sentences, strict=True):
             found.setdefault(f"{sentence} ({code.value})", []).append(number)
-            advice[f"{sentence} ({code.value})"] = language.advice[code]
+            advice[f"{sentence} ({code.value})"] = language.remedy(code, crossing.method)
     if not found:
         return
     yield tag("h3", language.text("heading.reasons"))

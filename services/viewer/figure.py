@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from schemas.reasons import Reason
 from schemas.results import RoadResult
 from services.common.arrays import Floats
 from services.common.language import ENGLISH
@@ -348,7 +347,7 @@ def _explanation(crossing: CrossingView) -> list[str]:
     """Return all reasons of a rejection, which the banner may shorten, and what to do next."""
     if crossing.rigidity_nm2 is not None:
         return []
-    advice = dict.fromkeys(ENGLISH.advice[Reason(code)] for code in crossing.reasons)
+    advice = dict.fromkeys(ENGLISH.remedy(code, crossing.method) for code in crossing.reasons)
     why, then = (
         [line for text in texts for line in textwrap.wrap(f"• {text}", 95, subsequent_indent="  ")]
         for texts in (crossing.reason_texts, advice)

@@ -56,3 +56,4 @@ def test_search_that_does_not_converge_gives_no_number(monkeypatch: pytest.Monke
     result = faults.identified(faults.crossing(Truth()), SETTINGS)
     assert (result.verdict, result.parameters) == ("rejected", None)
     assert result.reasons == (Reason.NOT_CONVERGED,)
+    assert result.reason_texts == ("The search did not converge: it reached its limit of steps.",)

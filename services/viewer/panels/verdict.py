@@ -6,7 +6,6 @@ from typing import Final
 
 import rerun.blueprint as rrb
 
-from schemas.reasons import Reason
 from services.common.language import ENGLISH
 from services.identification.comparison import Comparison
 from services.viewer.crossing_scene import CrossingScene, Panel
@@ -28,7 +27,7 @@ PANEL: Final = Panel(lambda scene: scene.crossing, _layout, _log)
 
 def _advice(crossing: CrossingView) -> list[str]:
     """Return what to do about each reason, as Markdown."""
-    advice = dict.fromkeys(ENGLISH.advice[Reason(code)] for code in crossing.reasons)
+    advice = dict.fromkeys(ENGLISH.remedy(code, crossing.method) for code in crossing.reasons)
     return ["", "**What to do next**", "", *(f"- {one}" for one in advice)] if advice else []
 
 

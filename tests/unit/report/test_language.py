@@ -8,13 +8,20 @@ import matplotlib
 import numpy as np
 import pytest
 
+from pre_core.search.loop import Termination
 from schemas.reasons import LEFT_OUT_TEXTS, REASON_TEXTS, BridgeReason, Reason, texts
 from schemas.results import results_json
 from schemas.site import Site
 from services.common.language import ENGLISH, LANGUAGES, Language, language_of
 from services.history.bridge_history import bridge_history
 from services.history.history_store import add_results
-from services.identification.fit_reasons import _place_of_misfit, contradicted_frequency
+from services.identification.fit_reasons import (
+    FAR_FROM_MEASUREMENT,
+    _place_of_misfit,
+    contradicted_frequency,
+    words_of_ending,
+)
+from services.identification.paper_method import FAR_FROM_SITE
 from services.report.alarm_words import alarm_sentence
 from services.report.bridge import bridge_reports
 from services.report.history_section import history_section
@@ -74,10 +81,17 @@ def test_german_remedy_names_what_the_english_one_names(code: Reason) -> None:
 @pytest.mark.parametrize(("language", "cause"), [(ENGLISH, "receiver"), (GERMAN, "Empfänger")])
 def test_remedy_of_a_failed_search_names_receiver_errors(language: Language, cause: str) -> None:
     """Least squares have no model of them; pre has one."""
-    remedy = language.advice[Reason.NOT_CONVERGED]
-    at = [remedy.find(word) for word in ("least_squares", cause, " pre")]
-    assert -1 not in at
-    assert at == sorted(at)
+    for method in ("least_squares", "random_walk"):
+        remedy = language.remedy(Reason.NOT_CONVERGED, method)
+        assert -1 < remedy.lower().find(cause.lower()) < remedy.find(" pre")
+    of_pre = language.remedy(Reason.NOT_CONVERGED, "pre")
+    assert of_pre == language.advice[Reason.NOT_CONVERGED]
+    assert cause.lower() not in of_pre.lower()
+    assert " pre" not in of_pre
+
+
+def test_other_remedies_do_not_depend_on_the_method() -> None:
+    assert ENGLISH.remedy("tandem", "least_squares") == ENGLISH.advice["tandem"]
 
 
 def test_numbers_are_written_as_in_the_language() -> None:
@@ -97,6 +111,16 @@ def test_details_of_a_reason_are_kept_in_another_language() -> None:
     older = "Two channels seem to be exchanged: sprung_front and sprung_rear."
     assert GERMAN.reason("channel_swapped", older) == expected
     assert GERMAN.reason("channel_swapped", "<b>") == "Zwei Kanäle scheinen vertauscht zu sein."
+
+
+def test_german_names_the_ending_of_a_search_in_german() -> None:
+    endings = [words_of_ending(one) for one in (Termination.STEPS_EXHAUSTED, Termination.STUCK)]
+    for ending in (*endings, FAR_FROM_MEASUREMENT, FAR_FROM_SITE):
+        (stored,) = texts([Reason.NOT_CONVERGED], {Reason.NOT_CONVERGED: ending})
+        assert stored == f"The search did not converge: {ending}."
+        german = GERMAN.reason("not_converged", stored)
+        assert german.startswith("Die Suche ist nicht konvergiert: ")
+        assert not re.search(r"\b(it|the|fit|values|no)\b", german), german
 
 
 def test_german_misfit_names_place_and_frequency_in_german() -> None:

@@ -168,7 +168,7 @@ def test_explanation_of_a_rejection_hides_no_truth() -> None:
     written = " ".join(" ".join(text.get_text() for text in words(figure)).split())
     for one in why:
         assert f"• {REASON_TEXTS[one]}" in written
-        assert f"• {ENGLISH.advice[one]}" in written
+        assert f"• {ENGLISH.remedy(one, rejected.method)}" in written
     rigidity, profiles = figure.axes[:2]
     truths = [line for axes in (rigidity, profiles) for line in axes.lines]
     truths = [line for line in truths if line.get_label() == "truth"]
