@@ -220,8 +220,12 @@ def _list_expected(key: str, tables: Tables) -> str:
         return _TABLE_LISTS[key]
     if key == "shares":
         return "a list with one number for each axle of the bogie"
-    if key == "track_m":
+    if key in ("track_m", "tyre_width_m"):
         return "a length in m or a pair [front, rear]"
+    if key == "twin_tyre_distance_m":
+        return (
+            "0 for single tyres or a pair [front, rear], such as [0, 0.33]: front tyres are single"
+        )
     if key in ("vehicle", "bridge", "ros2"):
         return f"a table [{key}] or several [[{key}]]"
     if key in ("flexural_rigidity_per_element_nm2", "element_lengths_m"):

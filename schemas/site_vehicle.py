@@ -44,6 +44,11 @@ def _two(value: object) -> object:
     return [value] * 2 if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
+def _none_twin(value: object) -> object:
+    """Expand a zero, single tyres on both axles, to a pair; front tyres are never twin."""
+    return _two(value) if isinstance(value, int | float) and value == 0 else value
+
+
 class WithSpreads(Table):
     """A table whose values may have spreads."""
 
@@ -88,10 +93,10 @@ class Vehicle(WithSpreads):
     """Ratio κ: the pitch inertia is κ·m_s·d_1·d_2."""
     tyre_damping_ns_per_m: NotNegativePair = (0.0, 0.0)
     """Tyre damping; zero: unknown (see `scale_at_zero`)."""
-    tyre_width_m: PositivePair | None = None
+    tyre_width_m: Annotated[PositivePair | None, BeforeValidator(_two)] = None
     """Tread widths; with the next four they determine the profile mismatch of the axles."""
     tyre_contact_length_m: PositivePair | None = None
-    twin_tyre_distance_m: NotNegativePair | None = None
+    twin_tyre_distance_m: Annotated[NotNegativePair | None, BeforeValidator(_none_twin)] = None
     """Distance between the centres of twin tyres; 0 for single tyres."""
     track_m: Annotated[tuple[Track, Track] | None, BeforeValidator(_two)] = None
     """Distance between the centres of the left and right wheels of each axle."""

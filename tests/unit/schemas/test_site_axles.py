@@ -135,6 +135,34 @@ def test_a_track_is_a_number_or_a_pair(track: str, tracks: tuple[float, float]) 
     assert vehicle.vehicles[0].track_m == tracks
 
 
+@pytest.mark.parametrize(
+    ("line", "pair"),
+    [
+        ("tyre_width_m = 0.25", (0.25, 0.25)),
+        ("tyre_width_m = [0.25, 0.22]", (0.25, 0.22)),
+        ("twin_tyre_distance_m = 0", (0.0, 0.0)),
+        ("twin_tyre_distance_m = 0.0", (0.0, 0.0)),
+        ("twin_tyre_distance_m = [0, 0.33]", (0.0, 0.33)),
+    ],
+)
+def test_tyres_are_a_number_or_a_pair(line: str, pair: tuple[float, float]) -> None:
+    key = line.split()[0]
+    number = parse_site(TEXT.replace("[bridge]", f"{line}\n[bridge]", 1), "a")
+    pairs = parse_site(TEXT.replace("[bridge]", f"{key} = {list(pair)}\n[bridge]", 1), "a")
+    assert getattr(number.vehicles[0], key) == pair
+    assert site_hash(number) == site_hash(pairs)
+    assert parse_site(site_toml(number), "b") == number
+
+
+@pytest.mark.parametrize("value", ["0.33", "false", '"none"'])
+def test_one_twin_distance_for_both_axles_is_refused(value: str) -> None:
+    text = TEXT.replace("[bridge]", f"twin_tyre_distance_m = {value}\n[bridge]", 1)
+    assert test_site.complaint(text) == (
+        f"vehicle.twin_tyre_distance_m is {value}, it must be 0 for single tyres or a pair "
+        "[front, rear], such as [0, 0.33]: front tyres are single"
+    )
+
+
 def test_equal_tracks_have_one_hash() -> None:
     one, pair, other, none = (
         parse_site(TEXT.replace("[bridge]", f"{line}\n[bridge]", 1), "a")
