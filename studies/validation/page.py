@@ -48,15 +48,16 @@ and bearing compliance (half-normal; absent in half of the draws), tyre damping 
 wheelbase (0.2 %), gains (1 %) and delays (0.5 ms) of the channels, the total mass
 (1 %) and the gain common to all channels (1 %), the receiver's slow error (1.5 m), noise and
 latency (0.1 s), the height of the centre of gravity (15 %). No draw is truncated or discarded.
-Sensors have biases of 0.03 m/s², rates of 200 to 2000 Hz and noise of 25 to 100 µg/√Hz, correctly
-declared; receivers give one or ten fixes a second. Roads are of ISO class A or B; speeds are 5 to
-25 m/s in both directions, four in ten with accelerations of 0.1 to 1 m/s².
+Sensors have biases of 0.03 m/s², rates of 200 to 2000 Hz and a declared noise of 25 to 100 µg/√Hz;
+receivers give one or ten fixes a second. Roads are of ISO class A or B; speeds are 5 to 25 m/s in
+both directions, four in ten with accelerations of 0.1 to 1 m/s². Both axles follow one road
+profile; in the row `surface` [below](#out-of-model-effects) they do not.
 
 The truth is computed with ten finite elements for each element, 40 modes and steps of 0.1 ms. Tyres
 average the road over their contact patch; the signals are measured, put into messages and read by
-the engine that reads recordings. The method does not share mesh, time step, integrator or exact
-position with the simulation, but it shares the model: a linear half-car on a beam at rest. Whether
-real trucks and bridges follow this model is not tested here.
+the engine that reads recordings. Mesh, time step, integrator and exact position are not the
+method's, but the model is: a linear half-car on a beam at rest. Whether real trucks and bridges
+follow it is not tested here.
 
 ![Errors, coverage, ranks and widths]({image})
 
@@ -64,7 +65,8 @@ Errors are judged in ln EI, in which the prior is normal: z = (ln median − ln 
 standard deviation that the 2.5 and 97.5 % quantiles give. The common scale uncertainty (total mass,
 gain) is part of both the interval and the truth. The bound is the Cramér–Rao bound of the same
 residuals, receiver and priors at the truth, where the variance of a restraint is that of a normal
-truncated at zero. Standard errors (±) follow from the scatter between crossings.
+truncated at zero, without absence, so standard deviations can be smaller. Standard errors
+(±) follow from the scatter between crossings.
 
 {elements}
 
@@ -78,9 +80,9 @@ truncated at zero. Standard errors (±) follow from the scatter between crossing
 
 Verdicts and reasons: {reasons}.
 
-Ranks: if the intervals are correct, the share of the posterior below the truth is uniformly
-distributed. Each parameter is tested by χ² over ten bins; a group fails if the smallest of its
-p-values times their number is below {smallest_p:g}.
+Ranks: with correct intervals the share of the posterior below the truth is uniform. Each parameter
+is tested by χ² over ten bins; a group fails if its smallest p-value times their number is below
+{smallest_p:g}.
 """
 
 _CONTROL = """
@@ -95,8 +97,8 @@ _SCENARIOS = """
 ## The paper's scenarios
 
 One crossing each at 10 m/s over a road of class A, with errors of the receiver (1.5 m slow; 0.4 m
-and 0.07 m/s white); the truck is that of the site file. Road and noise are drawn for each scenario,
-with its number as the seed. The table shows EI over the undamaged value, mean ± standard deviation,
+and 0.07 m/s white); the truck is that of the site file. Road and noise have the scenario's number
+as seed. The table shows EI over the undamaged value, mean ± standard deviation,
 and the paper's Table 7 (no noise, exact position; its ± is the spread of particles).
 
 | scenario | element | truth | paper | {columns} |
@@ -145,8 +147,6 @@ Not judged in this run: their folder does not exist.
 
 _ELSEWHERE = """
 ## Other evidence
-
-Each page gives its figures with their commands.
 
 | what | against | page |
 | --- | --- | --- |

@@ -295,9 +295,11 @@ def world_checks(records: Sequence[Record]) -> list[Aim]:
             )
         if line.crossings >= _FEWEST:
             found.append(Aim(f"{line.effect}: coverage", line.coverage, *_COVERAGE))
-            mean = line.mean_z if line.worst_mean_z is None else line.worst_mean_z
+            is_pooled = line.worst_mean_z is None
+            mean = line.mean_z if is_pooled else line.worst_mean_z
             size = None if mean is None else abs(mean)
-            found.append(Aim(f"{line.effect}: mean z", size, 0.0, _LARGEST_MEAN_Z))
+            name = "mean z" if is_pooled else "mean z of the worst element"
+            found.append(Aim(f"{line.effect}: {name}", size, 0.0, _LARGEST_MEAN_Z))
     return found
 
 
