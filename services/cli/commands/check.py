@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from services.cli.parser import Subcommand
-from services.common.options import flag, opt, output_option, positional
+from services.common.options import flag, opt, output_option, positional, site_option
 
 if TYPE_CHECKING:
     from services.inspection.inspect import CheckReport
@@ -24,6 +24,7 @@ class CheckOptions:
         nargs="*",
         metavar="SITE.toml|REC.mcap|DIR",
     )
+    site: Path | None = site_option("site file to check, also as an argument (then a .toml file)")
     template: Path | None = output_option(
         "write a commented site file to start from, and check nothing", "NEW.toml"
     )
@@ -41,12 +42,15 @@ def _check(options: CheckOptions) -> int:
     from services.common.progress import reading_bar
     from services.inspection.inspect import inspect
 
+    paths = options.paths if options.site is None else (options.site, *options.paths)
+    if options.site is not None and options.site.suffix != ".toml":
+        raise InputError(f"--site: {options.site} is not a .toml file")
     if options.template is not None:
         from services.inspection.template import TEMPLATE, template_of
         from services.simulation.usual_trucks import usual_lorry
 
-        if options.paths:
-            raise InputError(f"--template: checks nothing, give {options.paths[0]} without it")
+        if paths:
+            raise InputError(f"--template: checks nothing, give {paths[0]} without it")
         if options.template.exists():
             raise InputError(f"{options.template}: exists, give the name of a new site file")
         check_writable(options.template)
@@ -57,14 +61,14 @@ def _check(options: CheckOptions) -> int:
         return 0
     if options.truck is not None:
         raise InputError("--truck: fills in a new site file, give --template NEW.toml")
-    if not options.paths:
+    if not paths:
         raise InputError("a site file or recordings are expected, or --template NEW.toml")
-    for path in options.paths:
+    for path in paths:
         if path.suffix == ".toml":
             _raise_on_faults(path, wants_json=options.json)
-    recordings = [path for path in options.paths if path.suffix != ".toml"]
+    recordings = [path for path in paths if path.suffix != ".toml"]
     with reading_bar("checking", recordings) as next_file:
-        found = list(inspect(options.paths, next_file))
+        found = list(inspect(paths, next_file))
     is_wrong = any(report.is_wrong for report in found)
     if options.json:
         _print_json(found)

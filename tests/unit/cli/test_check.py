@@ -114,6 +114,24 @@ def test_bad_input(
     assert error.count("\n") == 1
 
 
+def test_site_is_an_option_or_an_argument(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site = str(project / "docs/site.example.toml")
+    sample = str(project / "recordings/sample/crossing.mcap")
+    outputs = []
+    for arguments in ([site, sample], [sample, "--site", site], ["--site", site, sample]):
+        cli.main(["check", *arguments])
+        outputs.append(capsys.readouterr().out)
+    assert outputs[0].startswith(site)
+    assert outputs[1] == outputs[0]
+    assert outputs[2] == outputs[0]
+    assert cli.main(["check", "--site", sample]) == 2
+    assert f"--site: {sample} is not a .toml file" in capsys.readouterr().err
+    assert cli.main(["check", site, "--site", site]) == 2
+    assert "a second site file" in capsys.readouterr().err
+
+
 def test_the_last_line_says_that_nothing_is_wrong(
     project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
