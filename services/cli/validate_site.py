@@ -122,7 +122,11 @@ def line_of(certificate: ValidationRecord, path: Path, known: Site) -> str:
     """Return a validation record of a site's pair in one line."""
     figures = certificate.figures
     how = "passed" if certificate.passed else "FAILED"
-    fewer = "" if figures.crossings == CROSSINGS else f" (of {CROSSINGS}, the rest not needed)"
+    fewer = (
+        ""
+        if figures.crossings == CROSSINGS
+        else f" after {figures.crossings} of at most {CROSSINGS} crossings"
+    )
     std = "" if figures.std is None else f"; EI ± {100.0 * figures.std:.0f} %"
     if std and certificate.conditions.road == "groove":
         std += _one_profile(known.vehicle(certificate.vehicle))

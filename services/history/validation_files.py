@@ -3,6 +3,8 @@
 import logging
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 
 from schemas.results import CrossingResult
@@ -98,7 +100,7 @@ def validation_notes(
     untried = []
     for pair, record in records.items():
         if record is None:
-            untried.append(pair.vehicle)
+            untried.append(pair)
         elif not record.passed:
             figures = record.figures
             kind = truck_to_try(site.vehicle(pair.vehicle), site.bridge(pair.bridge))
@@ -114,8 +116,14 @@ def validation_notes(
             )
             yield " ".join(filter(None, (text, frequent_reasons(record.crossings, language))))
     if untried:
-        trucks = language.listed(untried)
-        yield language.text("caution.unvalidated", trucks=trucks, folder=folder.absolute().name)
+        trucks = language.listed([pair.vehicle for pair in untried])
+        text = language.text("caution.unvalidated", trucks=trucks, folder=folder)
+        known = _pairs_in(folder)
+        otherwise = [pair.vehicle for pair in untried if pair in known]
+        if otherwise:
+            names = language.listed(otherwise)
+            text += " " + language.text("caution.validated_otherwise", trucks=names)
+        yield text
 
 
 def has_failed_validation(records: Records) -> bool:
@@ -165,7 +173,7 @@ class ValidatedPairs:
         """Yield the sentences on the pairs of a bridge: failed, untried, passed."""
         records = records_of(folder, site, sorted(self._pairs[bridge]))
         unvalidated = {pair: records[pair] for pair in sorted(self._unvalidated[bridge])}
-        yield from validation_notes(folder, site, unvalidated)
+        yield from validation_notes(folder.absolute(), site, unvalidated)
         yield from validations_passed(records)
 
 
@@ -176,6 +184,21 @@ def _record_of(folder: Path, site: Site, pair: VehicleBridgePair) -> ValidationR
     except KeyError:  # the site file is another one
         return None
     return _readable(path) if path.exists() else None
+
+
+def _pairs_in(folder: Path) -> frozenset[VehicleBridgePair]:
+    """Return the pairs of all readable records of a folder, whatever values they are for."""
+    return _scanned_pairs(folder, folder.stat().st_mtime_ns) if folder.is_dir() else frozenset()
+
+
+@lru_cache(maxsize=4)
+def _scanned_pairs(folder: Path, changed_ns: int) -> frozenset[VehicleBridgePair]:
+    """Return the pairs of a folder last changed at `changed_ns`; a fleet's bridges share one."""
+    found = set()
+    for path in folder.glob("*.json"):
+        with suppress(InputError):
+            found.add(load_validation(path).pair)
+    return frozenset(found)
 
 
 def _readable(path: Path) -> ValidationRecord | None:

@@ -70,9 +70,9 @@ def test_every_pair_gets_a_line_and_a_file(
         "truck-2 on bridge-1",
         "truck-2 on bridge-2",
     ]
-    assert "passed (of 12, the rest not needed): 8 of 8 crossings are good" in lines[0]
+    assert "passed after 8 of at most 12 crossings: 8 of 8 crossings are good" in lines[0]
     assert "EI ± 10 % on one road profile under both axles, so real crossings are less" in lines[0]
-    assert "FAILED (of 12, the rest not needed): 0 of 5 crossings are good" in lines[1]
+    assert "FAILED after 5 of at most 12 crossings: 0 of 5 crossings are good" in lines[1]
     found = {path: load_validation(path) for path in folder.iterdir()}
     assert len(found) == 4
     assert {one.seed for one in found.values()} == {4}

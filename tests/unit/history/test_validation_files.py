@@ -9,6 +9,7 @@ from schemas.site import Site
 from schemas.validation_records import VehicleBridgePair
 from services.common.language import ENGLISH, Language, language_of
 from services.history.validation_files import (
+    ValidatedPairs,
     pairs_without_validation,
     records_of,
     save,
@@ -36,7 +37,7 @@ def passed_of(
 def untried(folder: Path) -> str:
     return (
         "No site validation of truck-1 on this bridge in the folder "
-        f"{folder.name}: whether the intervals contain the truth has not been tested. Run "
+        f"{folder}: whether the intervals contain the truth has not been tested. Run "
         "driveby validate --site SITE.toml, or name its folder "
         "(--validations)."
     )
@@ -63,10 +64,12 @@ def test_untried_pairs_share_a_sentence(site: Site, tmp_path: Path) -> None:
 def test_relative_folder_is_named_as_a_whole(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It depends on the working folder, where a report may be made elsewhere than the record."""
+    """It depends on the working folder; a report, which is passed on, names it as given."""
     monkeypatch.chdir(tmp_path)
     folder = Path("recordings/certificates")
-    assert list(notes_of(folder, site, [PAIR])) == [untried(tmp_path / folder)]
+    pairs = ValidatedPairs(results_of(site, some_crossing("a")).crossings)
+    assert list(pairs.notes(folder, site, "bridge-1")) == [untried(tmp_path / folder)]
+    assert list(notes_of(folder, site, [PAIR])) == [untried(folder)]
 
 
 def test_record_of_the_pair_decides(site: Site, tmp_path: Path) -> None:
@@ -126,7 +129,11 @@ def test_record_of_another_truck_counts_for_nothing(site: Site, tmp_path: Path) 
     save(tmp_path, certificate(site))
     heavier = site.vehicles[0].model_copy(update={"total_mass_kg": 9999.0})
     changed = site.model_copy(update={"vehicles": (heavier,)})
-    assert list(notes_of(tmp_path, changed, [PAIR])) == [untried(tmp_path)]
+    (line,) = notes_of(tmp_path, changed, [PAIR])
+    assert line == (
+        f"{untried(tmp_path)} It has a record of truck-1 on this bridge for other values of truck, "
+        "bridge, sensors or receiver, or another method version."
+    )
 
 
 def test_unreadable_record_is_a_warning(

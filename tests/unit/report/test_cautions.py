@@ -381,7 +381,7 @@ def test_missing_or_failed_site_validation_is_named_once(
         assert all(caution in first for caution in report.cautions)
         return " ".join(report.cautions)
 
-    untried = words.text("caution.unvalidated", trucks="truck-1", folder=tmp_path.name)
+    untried = words.text("caution.unvalidated", trucks="truck-1", folder=tmp_path)
     assert cautions_with(found).count(untried) == 1
     failed = certificate(site, passed=False)
     save(tmp_path, failed)
