@@ -138,7 +138,7 @@ def level_lines(
     if not is_stated:
         yield f"overall stiffness: {level.mean:.2f} ± {level.std:.2f} of nominal"
     listed = ", ".join(f"{part.mean:.2f} ± {part.std:.2f}" for part in parts)
-    yield f"thirds of the span: {listed} (standard deviations)"
+    yield f"thirds of the bridge: {listed} (standard deviations)"
 
 
 def states_level(state: BridgeResult) -> bool:

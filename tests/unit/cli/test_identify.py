@@ -455,7 +455,7 @@ def test_single_crossing_has_the_finding_and_its_level_once(
         assert out.count("overall stiffness: 0.91 ± 0.05 of nominal") == times
         assert out.lower().count("overall stiffness") == 1
         assert "not resolved: EI_1 (standard deviation above 25 %)\n" in out
-        assert "thirds of the span: 0.91" in out
+        assert "thirds of the bridge: 0.91" in out
 
 
 def test_each_reason_is_followed_by_the_remedy_of_reports(

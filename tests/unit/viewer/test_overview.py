@@ -96,7 +96,7 @@ def test_the_overview_has_the_picture_of_the_bridge_and_the_finding(
         (
             ("a",),
             0.02,
-            "One crossing, fused with the between-crossing variability, unlike its own figure.",
+            "One crossing; its own figure omits the between-crossing variability shown here.",
         ),
         (("a",), None, "Values from one crossing."),
         (("a", "b"), 0.02, "Values from 2 fused crossings."),
