@@ -6,8 +6,9 @@ numbers count from the start of the drive.
 
 import re
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
+from difflib import get_close_matches
 from typing import Final, NamedTuple
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,9 +160,21 @@ def zone_of(name: str, where: str) -> tzinfo:
         return ZoneInfo(name)
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
         raise InputError(
-            f'{where}: no time zone "{name}" is known here (this computer may have no data of '
-            "zones); give the offset to UTC, as +01:00"
+            f'{where}: no time zone "{name}" is known here{_zone_meant(name)}'
         ) from error
+
+
+def _zone_meant(name: str) -> str:
+    """Return the end of the complaint about an unknown zone: a similar name, or what to give."""
+    known = sorted(available_timezones())
+    if not known:
+        return " (this computer has no data of zones); give the offset to UTC, as +01:00"
+    city = f"/{name.rpartition('/')[2]}".lower()
+    similar = [one for one in known if one.lower().endswith(city)]
+    similar += get_close_matches(name, known, 1, cutoff=0.85)
+    if similar:
+        return f", did you mean {similar[0]}? The offset to UTC, as +01:00, works too"
+    return "; give a name such as Europe/Berlin or the offset to UTC, as +01:00"
 
 
 def start_of(text: str, zone: tzinfo | None, where: str, *, has_zone_option: bool = True) -> float:
