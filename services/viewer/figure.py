@@ -62,8 +62,10 @@ from services.viewer.element_labels import (
     end_with_names,
     label_elements,
 )
+from services.viewer.residual_size import TREND_DEGREE
 
 HEIGHT_IN = 7.1
+_TREND = "cubic trend: mostly drift"
 _ERROR = "mean − truth, without offset, tilt and bend"
 _HEIGHT_WITHOUT_ROAD_IN = 4.4
 _HEADING_IN, _BANNER_IN = 1.17, 0.36
@@ -314,6 +316,9 @@ def _draw_differences(
     axes.axhline(0.0, color=MUTED, linewidth=0.7)
     if error is not None:
         axes.plot(road.x_m, error * factor, color="#8a939c", linewidth=1.6, label=_ERROR)
+    if road.x_m.size > TREND_DEGREE + 1:
+        trend = np.polynomial.Polynomial.fit(road.x_m, between, TREND_DEGREE)(road.x_m)
+        axes.plot(road.x_m, trend * factor, color=INK, linewidth=0.9, linestyle=":", label=_TREND)
     axes.plot(
         road.x_m,
         between * factor,

@@ -189,7 +189,9 @@ def test_differences_are_between_wheels_and_from_the_truth_where_it_is_known() -
     figure = draw(view())
     lines = {line.get_label(): line for line in figure.axes[2].lines}
     assert figure.axes[2].get_ylabel() == "mm"
-    assert lines["front − rear"].get_ydata() == pytest.approx(np.full(400, 2e-3))
+    between = np.full(400, 2e-3)
+    assert lines["front − rear"].get_ydata() == pytest.approx(between)
+    assert lines["cubic trend: mostly drift"].get_ydata() == pytest.approx(between)
     error = np.asarray(lines["mean − truth, without offset, tilt and bend"].get_ydata())
     known = X_M <= 30.0  # the truth of this test ends there
     whole = PROFILE_M[known] * 1e3
