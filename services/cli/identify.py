@@ -318,7 +318,7 @@ def _print_crossing(
         highlight=False,
     )
     console.print(f"verdict [bold]{crossing.verdict}[/]", highlight=False)
-    remedies = {code: ENGLISH.remedy(code, crossing.method) for code in crossing.reasons}
+    remedies = {code.value: ENGLISH.remedy(code, crossing.method) for code in crossing.reasons}
     print_reasons(console, crossing.reasons, crossing.reason_texts, remedies)
     if crossing.parameters is None:
         return
