@@ -111,6 +111,7 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     yield f"until the loss is detected with {wanted} probability at midspan; at both ends"
     yield "(elsewhere between the two numbers); clear: until a report calls the loss at"
     yield f"midspan clear; –: more than {MAX_CROSSINGS};"
+    yield f"midspan: EI_{found.planned.middle + 1}, at the middle of the longest span;"
     yield "equal single tyres: on equal tracks, to a centimetre;"
     yield "at … t: at most 18 t, with three axles 26 t, as in the EU; national limits may"
     yield "be lower;"
