@@ -113,13 +113,19 @@ class RoadMismatch(StrictModel):
 
 
 class RoadResult(StrictModel):
-    """The road profile over chainage: of each axle's wheel path, and their mean."""
+    """The road profile over chainage: of each axle's wheel path, and their mean.
+
+    Each profile is without its own straight line: level and slope are unknown.
+    """
 
     x_m: tuple[Finite, ...]
     front_m: tuple[Finite, ...]
     rear_m: tuple[Finite, ...]
     mean_m: tuple[Finite, ...]
     std_m: tuple[Finite, ...] | None = None
+    """Standard deviation of the error of `mean_m` without offset, tilt and bend, that is of the
+    error less its least-squares parabola over `x_m`. Twice integrated accelerations do not
+    determine the bend, and no spread covers it. None without a noise model."""
     iri_m_per_km: Finite | None = None
     iso_class: str | None = None
     mismatch: RoadMismatch | None = None

@@ -146,10 +146,13 @@ def gaussian(unit: str, mean: float, std: float) -> results.Parameter:
     )
 
 
-def detrended(x_m: Floats, height_m: Floats) -> Floats:
-    """Return heights (n,) less their straight line: level and slope are unknown."""
-    line = np.polynomial.Polynomial.fit(x_m, height_m, 1)
-    return np.asarray(height_m - line(x_m))
+def detrended(x_m: Floats, height_m: Floats, degree: int = 1) -> Floats:
+    """Return heights (n,) less their straight line, or less a polynomial of a higher degree.
+
+    Level and slope of a road are unknown; a parabola (degree 2) removes its bend, too.
+    """
+    trend = np.polynomial.Polynomial.fit(x_m, height_m, degree)
+    return np.asarray(height_m - trend(x_m))
 
 
 def road_result(

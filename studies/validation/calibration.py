@@ -47,17 +47,17 @@ def _estimates(result: CrossingResult) -> dict[str, Parameter]:
     return estimates
 
 
-def _road_z(result: CrossingResult, road: Profile) -> float | None:
+def road_z(result: CrossingResult, road: Profile) -> float | None:
     """Return the rms of the road's error over its standard deviation; None without a road.
 
-    Both are without their straight lines: integrated accelerations leave level and slope unknown.
+    The error is less its parabola: `std_m` does not cover offset, tilt and bend.
     """
     if result.road is None or result.road.std_m is None:
         return None
     x = np.array(result.road.x_m)
-    true = detrended(x, np.interp(x, road.x_m, road.height_m))
+    error = np.array(result.road.mean_m) - np.interp(x, road.x_m, road.height_m)
     std = np.maximum(np.array(result.road.std_m), 1e-9)
-    return float(np.sqrt(np.mean(((np.array(result.road.mean_m) - true) / std) ** 2)))
+    return float(np.sqrt(np.mean((detrended(x, error, 2) / std) ** 2)))
 
 
 def record(
@@ -89,7 +89,7 @@ def record(
         "chi2_per_dof": result.chi2_per_dof,
         "diagnostics": dict(result.diagnostics),
         "scale_error": result.scale_error,
-        "road_z": _road_z(result, drawn.road),
+        "road_z": road_z(result, drawn.road),
         "estimates": {
             name: {
                 "mean": p.mean,

@@ -267,7 +267,7 @@ _LABELS = {
     "acceptance": "acceptance",
     "seconds": "seconds, one process of two",
     "starts": "starts of the search",
-    "road_z": "rms error of the road over its std",
+    "road_z": "rms error of the road, without bend, over its std",
 }
 
 
