@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from schemas.results import Parameter
+from schemas.results import Parameter, Prior
 from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.notebook.arguments import names_of
@@ -27,6 +27,10 @@ _BELOW_ZERO: Final = 0.04
 _VISIBLE: Final = 0.2
 """Height of a density over its maximum from which it is seen."""
 _BINS: Final = 40
+_ZERO_BAR: Final = 0.02
+"""Part of a panel's width that a bar at zero has."""
+_SMALL_UNITS: Final = {"m/N": "mm/MN", "1/N": "1/GN"}
+"""Units in which compliances need no power of ten: 1e-9 of their own."""
 _POINTS: Final = 400
 """Number of points of a prior's curve."""
 _SHOWN: Final = 6.0
@@ -109,7 +113,8 @@ def plot_posterior(
     """Draw prior and posterior density of parameters, by default of all EI, with 95 % intervals.
 
     Each density is relative to its own maximum: a wide prior would be a flat line next to a narrow
-    posterior. The axis reaches the prior where the posterior is far from it. `truth`, of a
+    posterior. The axis reaches the prior where the posterior is far from it. Bars at zero are the
+    probabilities of exactly zero, and the densities those of all other values. `truth`, of a
     simulated crossing, draws the true EI.
 
     Raise InputError for an unknown name or a crossing without draws.
@@ -122,40 +127,89 @@ def plot_posterior(
         for name, axes in panels:
             _draw_densities(axes, solution.value[name], solution.draws[name], true_ei.get(name))
         figure.supylabel("density over its maximum", fontsize="medium")
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=3)
+        shown = {
+            label: handle
+            for axes in figure.axes
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=3)
     return figure
 
 
 def _draw_densities(axes: Axes, found: Parameter, drawn: Floats, true: float | None) -> None:
     """Draw prior and posterior of one parameter in a panel."""
-    divisor, unit = _shown_unit(found.mean, found.unit)
+    divisor, unit = _shown_unit(_size(found), found.unit)
     draws = drawn.ravel() / divisor
     window = (found.mean + np.array([-_SHOWN, _SHOWN]) * found.std) / divisor
     if found.prior is not None:
-        prior = prior_draws(found.prior) / divisor
-        limits = np.percentile(prior, _CUT)
-        if found.prior.distribution == "half_normal":
+        prior = found.prior.model_copy(update={"probability_zero": None})
+        of_prior = prior_draws(prior) / divisor
+        limits = np.percentile(of_prior, _CUT)
+        if prior.distribution == "half_normal":
             limits[0] = 0.0
         at = np.linspace(limits[0], limits[1], _POINTS)
-        heights = prior_density(found.prior, at * divisor)
+        heights = prior_density(prior, at * divisor)
         heights /= heights.max()
-        axes.fill_between(at, heights, color=_PRIOR, lw=0.0, label="prior")
-        window = _reaching(window, prior, heights, at)
-        if found.prior.distribution in ("half_normal", "log_normal"):
+        if found.prior.probability_zero != 1.0:
+            axes.fill_between(at, heights, color=_PRIOR, lw=0.0, label="prior")
+        if window[0] == window[1]:
+            window = np.array([-_BELOW_ZERO * limits[1], limits[1]])
+        window = _reaching(window, of_prior, heights, at)
+        if prior.distribution in ("half_normal", "log_normal"):
             window[0] = max(window[0], -_BELOW_ZERO * window[1])
     window = _with_width(window)
-    heights, edges = _density(draws, _with_width(np.array([draws.min(), draws.max()]), window))
-    axes.stairs(heights, edges, fill=True, color="C0", alpha=_POSTERIOR_OPACITY, label="posterior")
+    others = draws[draws != 0.0]
+    if others.size:
+        limits = _with_width(np.array([others.min(), others.max()]), window)
+        heights, edges = _density(others, limits)
+        axes.stairs(
+            heights, edges, fill=True, color="C0", alpha=_POSTERIOR_OPACITY, label="posterior"
+        )
     for limit in (found.q025, found.q975):
         axes.axvline(limit / divisor, color="0.3", lw=0.8, ls="--")
     if true is not None:
         axes.axvline(true / divisor, color="C3", lw=1.2, label="truth")
         window = np.array([min(window[0], true / divisor), max(window[1], true / divisor)])
+    _draw_zeros(axes, found.prior, 1.0 - others.size / draws.size, np.ptp(window))
     axes.set_xlim(*window)
     axes.set_ylim(0.0, 1.08)
     axes.set_xlabel(unit)
     axes.set_yticks([])
+
+
+def _draw_zeros(axes: Axes, prior: Prior | None, share: float, width: float) -> None:
+    """Draw bars at zero as high as its probabilities, and name them, if there are any.
+
+    `share` is that of the posterior draws, `width` that of the panel.
+    """
+    of_prior = 0.0 if prior is None else prior.probability_zero or 0.0
+    if max(of_prior, share) == 0.0:
+        return
+    bars = ((of_prior, 2.0, "0.55", "prior at zero"), (share, 1.0, "C0", "posterior at zero"))
+    for height, times, color, label in bars:
+        if height > 0.0:
+            half = 0.5 * times * _ZERO_BAR * width
+            axes.stairs([height], [-half, half], fill=True, color=color, label=label)
+    known = f"prior {100.0 * of_prior:.3g} %"
+    text = f"at zero: {known},\nposterior {100.0 * share:.3g} %"
+    if share == 1.0:
+        text = "zero in all draws" + (f"\n({known})" if of_prior else "")
+    behind = {"facecolor": "white", "alpha": 0.7, "lw": 0.0, "pad": 1.0}
+    axes.text(
+        *(0.97, 0.96, text),
+        transform=axes.transAxes,
+        ha="right",
+        va="top",
+        fontsize="small",
+        bbox=behind,
+    )
+
+
+def _size(found: Parameter) -> float:
+    """Return the size of the values to be drawn, by which a unit is chosen."""
+    if found.mean != 0.0 or found.prior is None:
+        return found.mean
+    return max(abs(found.prior.location), found.prior.scale)
 
 
 def _with_width(limits: Floats, within: Floats | None = None) -> Floats:
@@ -223,6 +277,8 @@ def _shown_unit(value: float, unit: str) -> tuple[float, str]:
     for divisor, prefix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if unit.startswith("N") and abs(value) >= divisor:
             return divisor, prefix + unit
+    if unit in _SMALL_UNITS:
+        return 1e-9, _SMALL_UNITS[unit]
     return 1.0, unit
 
 

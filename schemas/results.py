@@ -33,6 +33,9 @@ class Prior(StrictModel):
     scale: Finite
     """Relative standard deviation of log_normal, half width of uniform; otherwise the standard
     deviation, or that of the normal of half_normal, in the parameter's unit."""
+    probability_zero: Annotated[Finite, Field(ge=0, le=1)] | None = None
+    """Probability of exactly zero, where the prior has a spike there; the distribution is that of
+    all other values. None without a spike, and in older results."""
 
 
 class Parameter(StrictModel):

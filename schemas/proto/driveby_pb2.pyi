@@ -155,14 +155,16 @@ class Crossing(_message.Message):
     def __init__(self, schema_version: _Optional[int] = ..., crossing_id: _Optional[str] = ..., vehicle: _Optional[str] = ..., bridge: _Optional[str] = ..., direction: _Optional[_Union[Direction, str]] = ..., state: _Optional[_Union[CrossingState, str]] = ..., time_ns: _Optional[int] = ..., entry_time_ns: _Optional[int] = ..., exit_time_ns: _Optional[int] = ...) -> None: ...
 
 class Prior(_message.Message):
-    __slots__ = ("distribution", "location", "scale")
+    __slots__ = ("distribution", "location", "scale", "probability_zero")
     DISTRIBUTION_FIELD_NUMBER: _ClassVar[int]
     LOCATION_FIELD_NUMBER: _ClassVar[int]
     SCALE_FIELD_NUMBER: _ClassVar[int]
+    PROBABILITY_ZERO_FIELD_NUMBER: _ClassVar[int]
     distribution: str
     location: float
     scale: float
-    def __init__(self, distribution: _Optional[str] = ..., location: _Optional[float] = ..., scale: _Optional[float] = ...) -> None: ...
+    probability_zero: float
+    def __init__(self, distribution: _Optional[str] = ..., location: _Optional[float] = ..., scale: _Optional[float] = ..., probability_zero: _Optional[float] = ...) -> None: ...
 
 class Parameter(_message.Message):
     __slots__ = ("unit", "mean", "std", "q025", "q50", "q975", "prior")

@@ -351,7 +351,10 @@ def _prior(problem: posterior.PosteriorProblem, i: int) -> results.Prior:
     priors = problem.priors
     if priors.half_normal[i]:
         return results.Prior(
-            distribution="half_normal", location=0.0, scale=float(priors.spread[i])
+            distribution="half_normal",
+            location=0.0,
+            scale=float(priors.spread[i]),
+            probability_zero=float(priors.absence[i]) or None,
         )
     return results.Prior(
         distribution="log_normal", location=float(priors.theta[i]), scale=float(priors.spread[i])

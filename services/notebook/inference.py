@@ -20,8 +20,8 @@ _SEED: Final = 1
 def prior_of(crossings: Sequence[CrossingResult]) -> "xr.Dataset":
     """Return draws of the priors as arrays (chain, draw, crossing), one chain of 2000.
 
-    The names are those of the posterior. Common factors of mass and gain are not in them, nor is
-    the probability of one half that a spring, a compliance or a torsion is exactly zero.
+    The names are those of the posterior. Common factors of mass and gain are not in them. A prior
+    with a spike gives zeros, so results of older programs, which do not name it, give none.
     """
     rng = np.random.default_rng(_SEED)
     drawn = []
@@ -40,7 +40,7 @@ def prior_draws(prior: Prior) -> Floats:
 
 
 def prior_density(prior: Prior, values: Floats) -> Floats:
-    """Return the density of a prior at values (n,), up to a constant factor."""
+    """Return the density of a prior without its spike, at values (n,), up to a constant factor."""
     if prior.distribution == "uniform":
         return (np.abs(values - prior.location) <= prior.scale).astype(np.float64)
     if prior.distribution == "log_normal":
@@ -53,7 +53,15 @@ def prior_density(prior: Prior, values: Floats) -> Floats:
 
 
 def _drawn(prior: Prior, rng: np.random.Generator) -> Floats:
-    """Return draws (n,) of a prior."""
+    """Return draws (n,) of a prior, with the zeros of its spike."""
+    values = _continuous(prior, rng)
+    if prior.probability_zero is None:
+        return values
+    return np.where(rng.random(_DRAWS) < prior.probability_zero, 0.0, values)
+
+
+def _continuous(prior: Prior, rng: np.random.Generator) -> Floats:
+    """Return draws (n,) of a prior's distribution, without its spike."""
     if prior.distribution == "uniform":
         return prior.location + prior.scale * rng.uniform(-1.0, 1.0, _DRAWS)
     standard = rng.standard_normal(_DRAWS)

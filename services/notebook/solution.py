@@ -145,7 +145,7 @@ class Identification(NamedTuple):
         """Return draws of the priors, named as the posterior's; needs xarray.
 
         Springs, compliances and, without a declared lane, torsion are zero with a probability of
-        one half; the draws are of the other half.
+        one half (`probability_zero`), in these draws, too.
         """
         return prior_of([solution.crossing for solution in self.solutions if solution.draws])
 

@@ -38,6 +38,24 @@ def test_prior_draws_have_the_declared_quantiles_and_units(crossing: CrossingRes
     assert {"EI_1", "rhoA", "f_start"} <= set(drawn)
 
 
+def test_prior_draws_have_the_zeros_of_the_spike(crossing: CrossingResult) -> None:
+    assert crossing.parameters is not None
+    for probability in (0.5, 1.0):
+        f_start = crossing.parameters["f_start"]
+        assert f_start.prior is not None
+        spiked = f_start.prior.model_copy(update={"probability_zero": probability})
+        parameters = crossing.parameters | {
+            "f_start": f_start.model_copy(update={"prior": spiked}),
+        }
+        drawn = prior_of([crossing.model_copy(update={"parameters": parameters})])
+        values = drawn["f_start"].to_numpy().ravel()
+        assert np.mean(values == 0.0) == pytest.approx(probability, abs=0.04)
+        others = values[values != 0.0]
+        if others.size:
+            assert np.sqrt(np.mean(others**2)) == pytest.approx(spiked.scale, rel=0.1)
+        assert (drawn["rhoA"].to_numpy() > 0.0).all()
+
+
 def test_file_holds_posterior_prior_and_diagnostics(
     crossing: CrossingResult, tmp_path: Path
 ) -> None:

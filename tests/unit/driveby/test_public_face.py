@@ -1041,7 +1041,35 @@ def test_draws_that_are_all_zero_are_drawn(found: driveby.Identification) -> Non
         (posterior,) = axes.patches
         low, high = axes.get_xlim()
         assert low <= 0.0 < high
-        assert 0.0 < np.ptp(posterior.get_data().edges) < 0.1 * (high - low)
+        assert 0.01 * (high - low) < np.ptp(posterior.get_data().edges) < 0.1 * (high - low)
+        (note,) = axes.texts
+        assert note.get_text() == "zero in all draws"
+
+
+def test_probabilities_of_zero_are_bars_in_the_plot(found: driveby.Identification) -> None:
+    """The site file leaves restraint, compliance and torsion a probability of one half of zero."""
+    (solution,) = found.solutions
+    for name in ("f_start", "k_rot_end", "torsion"):
+        prior = solution.value[name].prior
+        assert prior is not None
+        assert prior.probability_zero == 0.5
+        share = np.mean(solution.draws[name] == 0.0)
+        assert share > 0.5
+        (axes,) = driveby.plot_posterior(solution, [name]).axes
+        bars = {bar.get_label(): bar.get_data() for bar in axes.patches}
+        assert bars["prior at zero"].values == [0.5]
+        assert bars["posterior at zero"].values == pytest.approx([share])
+        low, high = axes.get_xlim()
+        assert -0.2 * high < low < 0.0 < high
+        (note,) = axes.texts
+        is_all = share == 1.0
+        assert ("zero in all draws" in note.get_text()) == is_all
+        assert ("posterior" in bars) != is_all
+        unit = "kN·m/rad" if name == "k_rot_end" else {"f_start": "mm/MN"}.get(name, "1/GN")
+        assert axes.get_xlabel() == unit
+    rho_a = solution.value["rhoA"].prior
+    assert rho_a is not None
+    assert rho_a.probability_zero is None
 
 
 def test_residual_has_a_band_of_its_expected_size(found: driveby.Identification) -> None:

@@ -42,7 +42,11 @@ names = st.text(st.characters(codec="utf-8", exclude_categories=["Cs"]), min_siz
 # What a float holds of a time since 1970 is a quarter of a microsecond; microseconds come back.
 times = st.integers(10**15, 4 * 10**15).map(lambda us: us / 1e6)
 priors = st.builds(
-    Prior, distribution=st.sampled_from(["normal", "log_normal"]), location=numbers, scale=numbers
+    Prior,
+    distribution=st.sampled_from(["normal", "log_normal"]),
+    location=numbers,
+    scale=numbers,
+    probability_zero=st.none() | st.floats(0.0, 1.0),
 )
 parameters = st.builds(
     Parameter,
