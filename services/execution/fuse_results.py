@@ -9,6 +9,7 @@ from schemas.results import BridgeResult, CrossingResult, ResultHeader, Results,
 from schemas.settings import IdentificationSettings
 from services.common.errors import InputError
 from services.common.progress import Parts, no_part_progress
+from services.finding.stays import MERGE_S
 from services.identification.bridge_state import (
     FusionSettings,
     RecentCrossings,
@@ -57,9 +58,10 @@ class CrossingsToFuse(NamedTuple):
 
 
 def crossings_to_fuse(name: str, files: Sequence[Results]) -> CrossingsToFuse:
-    """Return the crossings of the files; raise InputError if they are of several realms.
+    """Return the crossings of the files, each once.
 
-    `name` is the place that errors begin with.
+    Raise InputError if they are of several realms, or if a truck enters a bridge twice in less than
+    5 s; `name` is the place that such an error begins with.
     """
     ordered = sorted(files, key=lambda one: one.created)
     crossings = {c.crossing_id: c for one in ordered for c in one.crossings}
@@ -68,7 +70,22 @@ def crossings_to_fuse(name: str, files: Sequence[Results]) -> CrossingsToFuse:
         raise InputError(f"{name}: crossings of {', '.join(realms)}; {ONE_REALM}")
     repeated = sum(len(one.crossings) for one in ordered) - len(crossings)
     by_time = sorted(crossings.values(), key=lambda crossing: crossing.entry_time)
+    _check_entries(name, [one for one in by_time if one.parameters is not None])
     return CrossingsToFuse(ordered[-1], tuple(by_time), repeated)
+
+
+def _check_entries(name: str, by_time: Sequence[CrossingResult]) -> None:
+    """Raise InputError for two entries of one truck on one bridge that are one crossing."""
+    newest: dict[tuple[str, str], CrossingResult] = {}
+    for one in by_time:
+        before = newest.get((one.vehicle, one.bridge))
+        if before is not None and one.entry_time - before.entry_time < MERGE_S:
+            raise InputError(
+                f"{name}: {before.crossing_id} and {one.crossing_id} begin less than "
+                f"{MERGE_S:g} s apart, which is one crossing: give one result of it, and start "
+                "each simulated one at another time"
+            )
+        newest[one.vehicle, one.bridge] = one
 
 
 def fuse_crossings(

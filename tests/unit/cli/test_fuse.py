@@ -31,6 +31,21 @@ def test_duplicate_results_count_once_and_are_reported(
     assert "another file" not in capsys.readouterr().out
 
 
+def test_entries_less_than_5_s_apart_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, later = crossing(0), crossing(1)
+    for apart_s, vehicle, code in ((4.9, first.vehicle, 2), (-0.4, first.vehicle, 2),
+                                   (5.1, first.vehicle, 0), (0.4, "other", 0)):  # fmt: skip
+        moved = {"entry_time": first.entry_time + apart_s, "vehicle": vehicle}
+        path = write(tmp_path / "r.json", [first, later.model_copy(update=moved)])
+        assert main(["fuse", str(path)]) == code, apart_s
+        error = capsys.readouterr().err
+        assert ("begin less than 5 s apart, which is one crossing" in error) == (code == 2)
+        assert error.count("\n") <= 1
+        assert (later.crossing_id in error) == (code == 2)
+
+
 def test_wider_intervals_are_explained_for_one_crossing_only(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
