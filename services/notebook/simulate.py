@@ -3,11 +3,12 @@
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pre_core.physics.road import Profile
 from schemas.site import Site
 from schemas.topics import Message
 from services.common.errors import InputError
@@ -52,6 +53,10 @@ _TOO_SLOW: Final = (
     f"speed is {{:g}} m/s on average: identify() rejects crossings below {SLOWEST_M_PER_S:g} m/s"
 )
 _RATIOS: Final = "a ratio for each element, such as [1, 1, 0.4]"
+_LARGEST_RATIO: Final = 10.0
+"""EI over nominal above which per cent are likely."""
+_FASTEST_M_PER_S: Final = 30.0
+"""Speed above which km/h are likely."""
 _NO_TRUTH: Final = (
     "give either scenario= or ei=, such as scenario=6 or ei=[1, 1, 1, 0.4, 1, 1, 1], a ratio for "
     "each element"
@@ -134,12 +139,12 @@ def check_truth(truth: Simulation | None) -> None:
 def simulate(
     *,
     scenario: int | None = None,
-    ei: Sequence[float] | NDArray[Any] | None = None,
+    ei: "ArrayLike | None" = None,
     site: Name | Site | None = None,
-    road: str | tuple[ArrayLike, ArrayLike] | None = None,
+    road: "str | tuple[ArrayLike, ArrayLike] | None" = None,
     seed: int = 1,
     noise: float | None = None,
-    speed: float | Sequence[float] | NDArray[Any] = 10.0,
+    speed: "ArrayLike" = 10.0,
     direction: str = "start_to_end",
     gps_noise: bool = False,
     rate: float | None = None,
@@ -153,8 +158,8 @@ def simulate(
     level beyond its ends; `seed` draws road, noise and receiver errors. `noise` is the
     accelerometers' noise density in µg/√Hz, by default that of a given site, else 0; method pre
     needs some. `speed` is in m/s, or a pair (start, end); below 3 m/s, where identification rejects
-    a crossing, it brings a warning. `rate` in Hz is by default the site's. BLAS is limited to one
-    thread meanwhile.
+    a crossing, it brings a warning, as do values that are likely of another unit. `rate` in Hz is
+    by default the site's. BLAS is limited to one thread meanwhile.
 
     All drives begin at one time; crossings to be fused need others: `Simulation.started_at`.
 
@@ -163,8 +168,7 @@ def simulate(
     """
     if (scenario is None) == (ei is None):
         raise InputError(_NO_TRUTH)
-    if direction not in ("start_to_end", "end_to_start"):
-        raise InputError(f'direction is "{direction}", start_to_end or end_to_start expected')
+    is_forward = _is_forward(direction)
     number_of = None if scenario is None else whole("scenario", scenario, 1, _SCENARIOS)
     ratios = None if ei is None else numbers("ei", ei, 1e-3, 1e3, _RATIOS)
     speeds = one_or_two("speed", speed, 0.1, 60, "(start, end)")
@@ -174,6 +178,8 @@ def simulate(
     asked = None if noise is None else number("noise", noise, 0, 1e6)
     density = noise_density_of(None if site is None else known, asked)
     of_road = road_class_of(known, None) if road is None else given_road(road)
+    for line in _doubts(ratios, max(speeds), of_road):
+        warnings.warn(line, stacklevel=3)
     with one_blas_thread():
         drive = simulate_drive(
             known,
@@ -186,7 +192,31 @@ def simulate(
                 least_road_m=(0.0, 0.0) if site is None else SURVEY_ROAD_M,
             ),
             speed_m_per_s=speeds,
-            forward=direction == "start_to_end",
+            forward=is_forward,
             beyond=OutOfModelEffects(twist=twist_of(known.bridges[0])),
         )
     return Simulation(drive, declared_site(known, density, drive.run.rate_hz))
+
+
+def _is_forward(direction: str) -> bool:
+    """Return whether a direction is from the start to the end; raise InputError for another."""
+    if direction not in ("start_to_end", "end_to_start"):
+        raise InputError(f'direction is "{direction}", start_to_end or end_to_start expected')
+    return direction == "start_to_end"
+
+
+def _doubts(
+    ratios: Sequence[float] | None, speed_m_per_s: float, road: str | Profile
+) -> Iterator[str]:
+    """Yield a sentence for each value that is likely of another unit."""
+    if ratios is not None and max(ratios) > _LARGEST_RATIO:
+        yield f"ei is up to {max(ratios):g} times nominal: is it in per cent? Ratios are expected"
+    if speed_m_per_s > _FASTEST_M_PER_S:
+        yield (
+            f"speed is {speed_m_per_s:g} m/s, {3.6 * speed_m_per_s:.0f} km/h: is it in km/h? "
+            "m/s are expected"
+        )
+    if not isinstance(road, str):
+        slope = float(np.sqrt(np.mean((np.diff(road.height_m) / np.diff(road.x_m)) ** 2)))
+        if slope > 1.0:
+            yield f"road has an rms slope of {slope:.2g}: are its heights in mm? m are expected"
