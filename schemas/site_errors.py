@@ -235,7 +235,10 @@ def _list_expected(key: str, tables: Tables) -> str:
     if key == "bearings":
         return f"{_CHOICES[key]}, or a pair [start, end] of these"
     if key in tables["sensor"].model_fields:
-        return "a list of four, in the order sprung front, sprung rear, unsprung front, rear"
+        return (
+            "a number, or a list of four in the order sprung front, sprung rear, unsprung front, "
+            "rear"
+        )
     return "a pair [front, rear]"
 
 

@@ -1,6 +1,8 @@
 """Recordings and folders of CSV files as arrays, and as messages for an engine."""
 
+import re
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -16,6 +18,7 @@ from services.recordings.recording import read_messages, read_site
 
 Name: TypeAlias = str | PathLike[str]
 
+_OPTION: Final = re.compile(r"(?<![\w-])--[a-z]")
 _SOURCE: Final = "a recording (.mcap) or a folder of CSV files"
 _SITE: Final = "the name of a site file or what load_site() returns"
 
@@ -37,12 +40,27 @@ def read(
             found += signals_of_recording(path)
             continue
         known = site_of_folder(path, site)
-        if known is None:
-            found += signals_of_folder(path, None, "", "")
-        else:
-            name = _site_name(path, site)
-            found += signals_of_folder(path, known, name, vehicle_of(known, name, vehicle))
+        with _naming_import():
+            if known is None:
+                found += signals_of_folder(path, None, "", "")
+            else:
+                name = _site_name(path, site)
+                found += signals_of_folder(path, known, name, vehicle_of(known, name, vehicle))
     return found
+
+
+@contextmanager
+def _naming_import() -> Iterator[None]:
+    """Name the command of the options in errors of a folder, which Python does not have."""
+    try:
+        yield
+    except InputError as error:
+        if not _OPTION.search(str(error)):
+            raise
+        raise InputError(
+            f"{error}; these are options of driveby import: convert the folder with it, and give "
+            "its recording"
+        ) from error
 
 
 def paths_of(sources: Sequence[Name]) -> list[Path]:
@@ -79,7 +97,8 @@ def messages_of_paths(
     """Yield all messages of the sources; of a CSV folder those that its truck would have sent."""
     for path in paths:
         if path.is_dir():
-            yield from messages_of_folder(path, site, _site_name(path, given), vehicle)
+            with _naming_import():
+                yield from messages_of_folder(path, site, _site_name(path, given), vehicle)
         else:
             yield from read_messages(path)
 

@@ -1,12 +1,14 @@
 """`import driveby`: what a notebook gets, and that it gets the same numbers as the command line."""
 
 import ast
+import inspect
 import json
 import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -222,6 +224,21 @@ def with_gravity(path: Path, up: list[float]) -> None:
         for time_s, row in zip(times, felt, strict=True)
     ]
     path.write_text("\n".join([heading, *text, ""]))
+
+
+def test_folder_that_needs_options_is_referred_to_import(csv_example: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(csv_example, tmp_path / "folder")
+    for path in (folder / "accel_00.csv", folder / "gps_00.csv"):
+        head, *rows = path.read_text().splitlines()
+        cells = [row.split(",", 1) for row in rows]
+        dated = [
+            f"{datetime.fromtimestamp(float(s), UTC):%d.%m.%Y %T.%f},{rest}" for s, rest in cells
+        ]
+        path.write_text("\n".join([head, *dated, ""]))
+    words = "give --zone UTC.*these are options of driveby import: convert the folder with it"
+    for function in (driveby.read, driveby.identify):
+        with pytest.raises(driveby.InputError, match=words):
+            function(folder)
 
 
 def test_a_folder_is_read_as_its_site_file_says(csv_example: Path, tmp_path: Path) -> None:
@@ -990,6 +1007,26 @@ def test_simulate_recording_takes_the_options_of_the_command(
     with pytest.raises(driveby.InputError, match="--runs"):
         driveby.simulate_recording("drive.mcap", scenario=6, runs=0)
     assert len(given) == 1
+
+
+@pytest.mark.parametrize(
+    ("named", "words"),
+    [
+        ({"ei": [100] * 7}, "ei is up to 100 times nominal: is it in per cent"),
+        ({"ei": [1] * 7, "speed": 36}, "speed is 36 m/s, 130 km/h: is it in km/h"),
+        (
+            {"scenario": 6, "road": ([-70, 0, 1, 2, 70], [0, 0, 2, 0, 0])},
+            "road has an rms slope of 1.4: are its heights in mm",
+        ),
+    ],
+)
+def test_likely_errors_of_units_are_warned_of(named: Any, words: str) -> None:
+    with pytest.warns(UserWarning, match=words):
+        driveby.simulate(**named)
+
+
+def test_signature_of_simulate_is_short() -> None:
+    assert len(str(inspect.signature(driveby.simulate))) < 500
 
 
 def prior_seen(axes: Any) -> float:

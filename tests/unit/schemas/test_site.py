@@ -590,3 +590,9 @@ def test_misspelt_value_is_one_line(name: str, value: object, line: str) -> None
         with_values(load_site(EXAMPLE), {name: value})
     assert str(caught.value).startswith(line)
     assert "\n" not in str(caught.value)
+
+
+def test_densities_are_a_number_or_a_list_of_four() -> None:
+    site = parse_site(TEXT, "site.toml")
+    with pytest.raises(InputError, match=r'is "25", it must be a number, or a list of four in'):
+        with_values(site, {"sensor.noise_density_ug_per_rthz": "25"})
