@@ -187,6 +187,11 @@ class CrossingResult(StrictModel):
     road: RoadResult | None = None
     fusion_likelihood: FusionLikelihood | None = None
     """Input of fusion; None where the method provides no likelihood."""
+    element_edges_m: tuple[Finite, ...] | None = None
+    """Chainages of the elements' ends, from the start on: one more than elements. None in older
+    results."""
+    nominal_ei_nm2: tuple[Finite, ...] | None = None
+    """Nominal EI of each element; None in older results."""
 
     @model_validator(mode="before")
     @classmethod
@@ -283,6 +288,11 @@ class BridgeResult(BaseModel):
     """Excluded crossings; the newest if there are many."""
     crossings_left_out_count: Annotated[int, Field(ge=0)] = 0
     """Number of excluded crossings; counted where an older program listed all without a number."""
+    element_edges_m: tuple[Finite, ...] | None = None
+    """Chainages of the elements' ends, from the start on: one more than elements. None without
+    elements, and in older results."""
+    nominal_ei_nm2: tuple[Finite, ...] | None = None
+    """Nominal EI of each element, as the newest crossing has it; None like `element_edges_m`."""
 
     @model_validator(mode="before")
     @classmethod

@@ -24,6 +24,7 @@ from schemas.results import (
 from schemas.signals import NS_PER_S
 
 _THIRDS = tuple(Thirds.model_fields)
+_ELEMENTS = ("element_edges_m", "nominal_ei_nm2")
 _LOSSES = tuple(zip(("ten", "twenty", "thirty"), map(str, LOSSES_PERCENT), strict=True))
 """Field of each loss on the wire, and its percentage."""
 
@@ -100,7 +101,7 @@ def state_to_bridge(message: pb.BridgeState) -> tuple[str, int, BridgeResult]:
         element: {percent: of[name] for name, percent in _LOSSES}
         for element, of in values["probability_of_loss"].items()
     }
-    _empty_is_none(values, "finding", "weakest_element")
+    _empty_is_none(values, "finding", "weakest_element", *_ELEMENTS)
     for track in values["tracks"]:
         _check_direction(track)
     values |= values.pop("flexural_rigidity_nm2")
@@ -119,7 +120,7 @@ def direction_to_protobuf(direction: Direction) -> pb.Direction:
 def _crossing(values: dict[str, Any]) -> CrossingResult:
     """Return the result of an Estimate's fields without those of the header."""
     _check_direction(values)
-    _empty_is_none(values, "certificate")
+    _empty_is_none(values, "certificate", *_ELEMENTS)
     values["entry_time"] = _seconds(values.pop("entry_time_ns"))
     values["exit_time"] = _seconds(values.pop("exit_time_ns"))
     if values["verdict"] == "rejected":

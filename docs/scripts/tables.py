@@ -300,8 +300,18 @@ def parameters() -> str:
     return _table(("name", "unit", "quantity"), rows)
 
 
+_NOT_IN_SITE_FILE = {
+    "support_rotational_stiffness_nm_per_rad": "rotational restraint",
+    "support_compliance_m_per_n": "bearing compliance",
+    "torsional_flexibility_per_n": "e²/(GJ)",
+}
+"""Quantities, by their key, of which a site file has only the spread."""
+
+
 def _site_key(row: ParameterSpec) -> str:
-    """Return where the site file has the quantity of a parameter."""
+    """Return where the site file has the quantity of a parameter, or its name."""
+    if row.key in _NOT_IN_SITE_FILE:
+        return _NOT_IN_SITE_FILE[row.key]
     return "`[[vehicle.bogies]]` `shares`" if row.key == "tandem_share" else f"`{row.key}`"
 
 

@@ -364,7 +364,7 @@ class FusionLikelihood(_message.Message):
     def __init__(self, bridge: _Optional[_Iterable[_Union[Coordinate, _Mapping]]] = ..., truck: _Optional[_Iterable[_Union[Coordinate, _Mapping]]] = ..., root: _Optional[_Iterable[float]] = ..., target: _Optional[_Iterable[float]] = ..., element_lengths_m: _Optional[_Iterable[float]] = ..., mass_spread: _Optional[float] = ..., footprints: _Optional[_Iterable[_Union[Footprint, _Mapping]]] = ..., first_knot_m: _Optional[float] = ..., knot_spacing_m: _Optional[float] = ..., level_m3: _Optional[_Iterable[float]] = ..., off_bridge_m: _Optional[_Iterable[_Union[Stretch, _Mapping]]] = ..., bends: _Optional[_Union[Bends, _Mapping]] = ..., short_waves: _Optional[_Union[ShortWaves, _Mapping]] = ...) -> None: ...
 
 class Estimate(_message.Message):
-    __slots__ = ("schema_version", "program", "version", "created_ns", "site_hash", "settings_json", "seed", "crossing_id", "realm", "vehicle", "bridge", "direction", "entry_time_ns", "exit_time_ns", "speed_m_per_s", "method", "certificate", "verdict", "reasons", "reason_texts", "chi2_per_dof", "diagnostics", "parameters", "scale_error", "covariance", "derived", "road", "fusion_likelihood")
+    __slots__ = ("schema_version", "program", "version", "created_ns", "site_hash", "settings_json", "seed", "crossing_id", "realm", "vehicle", "bridge", "direction", "entry_time_ns", "exit_time_ns", "speed_m_per_s", "method", "certificate", "verdict", "reasons", "reason_texts", "chi2_per_dof", "diagnostics", "parameters", "scale_error", "covariance", "derived", "road", "fusion_likelihood", "element_edges_m", "nominal_ei_nm2")
     class DiagnosticsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -407,6 +407,8 @@ class Estimate(_message.Message):
     DERIVED_FIELD_NUMBER: _ClassVar[int]
     ROAD_FIELD_NUMBER: _ClassVar[int]
     FUSION_LIKELIHOOD_FIELD_NUMBER: _ClassVar[int]
+    ELEMENT_EDGES_M_FIELD_NUMBER: _ClassVar[int]
+    NOMINAL_EI_NM2_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     program: str
     version: str
@@ -435,7 +437,9 @@ class Estimate(_message.Message):
     derived: Derived
     road: RoadResult
     fusion_likelihood: FusionLikelihood
-    def __init__(self, schema_version: _Optional[int] = ..., program: _Optional[str] = ..., version: _Optional[str] = ..., created_ns: _Optional[int] = ..., site_hash: _Optional[str] = ..., settings_json: _Optional[str] = ..., seed: _Optional[int] = ..., crossing_id: _Optional[str] = ..., realm: _Optional[str] = ..., vehicle: _Optional[str] = ..., bridge: _Optional[str] = ..., direction: _Optional[_Union[Direction, str]] = ..., entry_time_ns: _Optional[int] = ..., exit_time_ns: _Optional[int] = ..., speed_m_per_s: _Optional[float] = ..., method: _Optional[str] = ..., certificate: _Optional[str] = ..., verdict: _Optional[_Union[Verdict, str]] = ..., reasons: _Optional[_Iterable[str]] = ..., reason_texts: _Optional[_Iterable[str]] = ..., chi2_per_dof: _Optional[float] = ..., diagnostics: _Optional[_Mapping[str, float]] = ..., parameters: _Optional[_Mapping[str, Parameter]] = ..., scale_error: _Optional[float] = ..., covariance: _Optional[_Union[Covariance, _Mapping]] = ..., derived: _Optional[_Union[Derived, _Mapping]] = ..., road: _Optional[_Union[RoadResult, _Mapping]] = ..., fusion_likelihood: _Optional[_Union[FusionLikelihood, _Mapping]] = ...) -> None: ...
+    element_edges_m: _containers.RepeatedScalarFieldContainer[float]
+    nominal_ei_nm2: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, schema_version: _Optional[int] = ..., program: _Optional[str] = ..., version: _Optional[str] = ..., created_ns: _Optional[int] = ..., site_hash: _Optional[str] = ..., settings_json: _Optional[str] = ..., seed: _Optional[int] = ..., crossing_id: _Optional[str] = ..., realm: _Optional[str] = ..., vehicle: _Optional[str] = ..., bridge: _Optional[str] = ..., direction: _Optional[_Union[Direction, str]] = ..., entry_time_ns: _Optional[int] = ..., exit_time_ns: _Optional[int] = ..., speed_m_per_s: _Optional[float] = ..., method: _Optional[str] = ..., certificate: _Optional[str] = ..., verdict: _Optional[_Union[Verdict, str]] = ..., reasons: _Optional[_Iterable[str]] = ..., reason_texts: _Optional[_Iterable[str]] = ..., chi2_per_dof: _Optional[float] = ..., diagnostics: _Optional[_Mapping[str, float]] = ..., parameters: _Optional[_Mapping[str, Parameter]] = ..., scale_error: _Optional[float] = ..., covariance: _Optional[_Union[Covariance, _Mapping]] = ..., derived: _Optional[_Union[Derived, _Mapping]] = ..., road: _Optional[_Union[RoadResult, _Mapping]] = ..., fusion_likelihood: _Optional[_Union[FusionLikelihood, _Mapping]] = ..., element_edges_m: _Optional[_Iterable[float]] = ..., nominal_ei_nm2: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class ElementState(_message.Message):
     __slots__ = ("mean", "std", "q025", "q975")
@@ -458,7 +462,7 @@ class LeftOut(_message.Message):
     def __init__(self, crossing_id: _Optional[str] = ..., reason: _Optional[str] = ...) -> None: ...
 
 class BridgeState(_message.Message):
-    __slots__ = ("schema_version", "bridge", "time_ns", "flexural_rigidity_nm2", "between_crossing_std", "crossings_used", "crossings_left_out", "crossings_left_out_count", "verdict", "reasons", "reason_texts", "finding", "weakest_element", "probability_of_loss", "level", "left", "middle", "right", "between_crossing_std_q025", "between_crossing_std_q975", "tracks")
+    __slots__ = ("schema_version", "bridge", "time_ns", "flexural_rigidity_nm2", "between_crossing_std", "crossings_used", "crossings_left_out", "crossings_left_out_count", "verdict", "reasons", "reason_texts", "finding", "weakest_element", "probability_of_loss", "level", "left", "middle", "right", "between_crossing_std_q025", "between_crossing_std_q975", "tracks", "element_edges_m", "nominal_ei_nm2")
     class FlexuralRigidityNm2Entry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -494,6 +498,8 @@ class BridgeState(_message.Message):
     BETWEEN_CROSSING_STD_Q025_FIELD_NUMBER: _ClassVar[int]
     BETWEEN_CROSSING_STD_Q975_FIELD_NUMBER: _ClassVar[int]
     TRACKS_FIELD_NUMBER: _ClassVar[int]
+    ELEMENT_EDGES_M_FIELD_NUMBER: _ClassVar[int]
+    NOMINAL_EI_NM2_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     bridge: str
     time_ns: int
@@ -515,7 +521,9 @@ class BridgeState(_message.Message):
     between_crossing_std_q025: float
     between_crossing_std_q975: float
     tracks: _containers.RepeatedCompositeFieldContainer[Track]
-    def __init__(self, schema_version: _Optional[int] = ..., bridge: _Optional[str] = ..., time_ns: _Optional[int] = ..., flexural_rigidity_nm2: _Optional[_Mapping[str, ElementState]] = ..., between_crossing_std: _Optional[float] = ..., crossings_used: _Optional[_Iterable[str]] = ..., crossings_left_out: _Optional[_Iterable[_Union[LeftOut, _Mapping]]] = ..., crossings_left_out_count: _Optional[int] = ..., verdict: _Optional[_Union[Verdict, str]] = ..., reasons: _Optional[_Iterable[str]] = ..., reason_texts: _Optional[_Iterable[str]] = ..., finding: _Optional[str] = ..., weakest_element: _Optional[str] = ..., probability_of_loss: _Optional[_Mapping[str, Losses]] = ..., level: _Optional[_Union[ElementState, _Mapping]] = ..., left: _Optional[_Union[ElementState, _Mapping]] = ..., middle: _Optional[_Union[ElementState, _Mapping]] = ..., right: _Optional[_Union[ElementState, _Mapping]] = ..., between_crossing_std_q025: _Optional[float] = ..., between_crossing_std_q975: _Optional[float] = ..., tracks: _Optional[_Iterable[_Union[Track, _Mapping]]] = ...) -> None: ...
+    element_edges_m: _containers.RepeatedScalarFieldContainer[float]
+    nominal_ei_nm2: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, schema_version: _Optional[int] = ..., bridge: _Optional[str] = ..., time_ns: _Optional[int] = ..., flexural_rigidity_nm2: _Optional[_Mapping[str, ElementState]] = ..., between_crossing_std: _Optional[float] = ..., crossings_used: _Optional[_Iterable[str]] = ..., crossings_left_out: _Optional[_Iterable[_Union[LeftOut, _Mapping]]] = ..., crossings_left_out_count: _Optional[int] = ..., verdict: _Optional[_Union[Verdict, str]] = ..., reasons: _Optional[_Iterable[str]] = ..., reason_texts: _Optional[_Iterable[str]] = ..., finding: _Optional[str] = ..., weakest_element: _Optional[str] = ..., probability_of_loss: _Optional[_Mapping[str, Losses]] = ..., level: _Optional[_Union[ElementState, _Mapping]] = ..., left: _Optional[_Union[ElementState, _Mapping]] = ..., middle: _Optional[_Union[ElementState, _Mapping]] = ..., right: _Optional[_Union[ElementState, _Mapping]] = ..., between_crossing_std_q025: _Optional[float] = ..., between_crossing_std_q975: _Optional[float] = ..., tracks: _Optional[_Iterable[_Union[Track, _Mapping]]] = ..., element_edges_m: _Optional[_Iterable[float]] = ..., nominal_ei_nm2: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Alarm(_message.Message):
     __slots__ = ("schema_version", "time_ns", "bridge", "alarm_id", "element", "is_stiffer", "since_ns", "raised_ns", "sum", "threshold", "ratio", "ratio_q025", "ratio_q975", "text", "is_acknowledged", "acknowledged_by", "acknowledged_ns", "note")

@@ -37,7 +37,7 @@ from services.identification.comparison import (
     weak_before,
 )
 from services.identification.fusing import FusedBridge, fused
-from services.identification.result_parts import part_of_elements
+from services.identification.result_parts import element_edges_m, part_of_elements
 from services.identification.usable import LISTED_AT_MOST as LISTED_AT_MOST
 from services.identification.usable import FusableCrossing
 from services.identification.usable import RecentCrossings as RecentCrossings
@@ -153,6 +153,8 @@ def state_of(
         crossings_used=found.used,
         crossings_left_out=_named(left_out),
         crossings_left_out_count=counted.number - len(found.used),
+        element_edges_m=element_edges_m(found.element_lengths_m),
+        nominal_ei_nm2=tuple(found.nominal_nm2.tolist()),
     )
     return state.model_copy(update={"finding": _finding(found, state, baseline)})
 

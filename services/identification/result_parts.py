@@ -1,6 +1,6 @@
 """Parts of results that several methods share."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,7 +64,14 @@ def header(
         "exit_time": data.wall_offset_s + passing.exit_s,
         "speed_m_per_s": passing.speed_m_per_s,
         "method": settings.method,
+        "element_edges_m": element_edges_m(data.bridge.lengths_m),
+        "nominal_ei_nm2": tuple(data.bridge.nominal_flexural_rigidity_nm2),
     }
+
+
+def element_edges_m(lengths_m: Sequence[float] | Floats) -> tuple[float, ...]:
+    """Return the chainages in m of the elements' ends, one more than lengths (n,)."""
+    return tuple(np.concatenate([[0.0], np.cumsum(lengths_m)]).tolist())
 
 
 def rejected(

@@ -1025,6 +1025,19 @@ def test_likely_errors_of_units_are_warned_of(named: Any, words: str) -> None:
         driveby.simulate(**named)
 
 
+def test_results_have_edges_and_nominal_rigidity_of_the_elements(
+    found: driveby.Identification,
+) -> None:
+    (solution,) = found.solutions
+    table = found.elements()
+    for one in (solution.crossing, *driveby.fuse(found).bridges.values()):
+        assert one.element_edges_m is not None
+        assert one.nominal_ei_nm2 is not None
+        assert list(one.element_edges_m[:-1]) == pytest.approx(list(table["from_m"]))
+        assert list(one.element_edges_m[1:]) == pytest.approx(list(table["to_m"]))
+        assert list(one.nominal_ei_nm2) == pytest.approx(list(table["nominal"]))
+
+
 def test_signature_of_simulate_is_short() -> None:
     assert len(str(inspect.signature(driveby.simulate))) < 500
 

@@ -118,6 +118,8 @@ def crossings(draw: st.DrawFn) -> CrossingResult:
         ),
         "road": draw(st.none() | roads()),
         "fusion_likelihood": draw(st.none() | likelihoods()),
+        "element_edges_m": draw(st.none() | st.just((0.0, 4.0, 9.0))),
+        "nominal_ei_nm2": draw(st.none() | st.just((1e10, 2e10))),
     }
     return CrossingResult(**values)
 
@@ -250,7 +252,7 @@ def test_the_file_has_the_fields_of_the_contract() -> None:
         "crossing_id", "realm", "vehicle", "bridge", "direction", "entry_time", "exit_time",
         "speed_m_per_s", "method", "certificate", "verdict", "reasons", "reason_texts",
         "chi2_per_dof", "diagnostics", "parameters", "scale_error", "covariance", "derived", "road",
-        "fusion_likelihood",
+        "fusion_likelihood", "element_edges_m", "nominal_ei_nm2",
     ]  # fmt: skip
     assert list(content["crossings"][0]["parameters"]["EI_1"]) == [
         "unit", "mean", "std", "q025", "q50", "q975", "prior",
@@ -261,7 +263,7 @@ def test_the_file_has_the_fields_of_the_contract() -> None:
         "between_crossing_std", "between_crossing_std_q025", "between_crossing_std_q975",
         "verdict", "reasons", "reason_texts", "finding", "weakest_element", "probability_of_loss",
         "level", "thirds", "tracks", "crossings_used", "crossings_left_out",
-        "crossings_left_out_count",
+        "crossings_left_out_count", "element_edges_m", "nominal_ei_nm2",
     }  # fmt: skip
 
 
