@@ -1186,6 +1186,8 @@ def test_diagnostic_plots_have_a_panel_for_each_parameter(
     assert alone.get_title(loc="left") == "rhoA"
     with pytest.raises(driveby.InputError, match="EI_9: is unknown"):
         driveby.plot_posterior(solution, ["EI_9"])
+    with pytest.raises(driveby.InputError, match="wheelbase_m: has draws only"):
+        driveby.plot_posterior(solution, ["wheelbase_m"])
     # The sample is not of this simulation: its truth is far away, and in the picture all the same.
     (with_truth,) = driveby.plot_posterior(solution, ["EI_4"], truth=simulation).axes
     ratio, nominal = simulation.ei_ratios[3], solution.bridge.nominal_flexural_rigidity_nm2[3]
