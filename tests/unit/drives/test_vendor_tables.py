@@ -22,7 +22,6 @@ from services.drives.tables.guesses import Guess, grouped
 from services.drives.tables.mapping import ImportMap, load_map, map_text
 from services.drives.tables.preview import preview_lines
 from services.drives.tables.reading import Understood
-from services.drives.tables.stamps import zone_of
 
 Columns = dict[str, Floats]
 
@@ -1100,18 +1099,3 @@ def test_equal_guesses_of_several_files_are_one_and_units_come_first() -> None:
     found = Understood([], guesses, ImportMap()).conversions()
     assert found[0] == f"A_1.csv and 2 more: {units}"
     assert len(found) == 2
-
-
-@pytest.mark.parametrize(
-    ("name", "meant"),
-    [
-        ("Berlin", "Europe/Berlin"),
-        ("Europe/Tokyo", "Asia/Tokyo"),
-        ("Europe/Berln", "Europe/Berlin"),
-    ],
-)
-def test_zone_that_is_not_known_is_named_with_its_like(name: str, meant: str) -> None:
-    with pytest.raises(InputError) as caught:
-        zone_of(name, "--zone")
-    assert f"did you mean {meant}? Otherwise give the offset to UTC" in str(caught.value)
-    assert "no data of time zones" not in str(caught.value)
