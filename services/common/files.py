@@ -232,7 +232,7 @@ def _check_replaceable(path: Path, *, force: bool) -> None:
             return
     if not force:
         raise InputError(
-            f"{path}: is a recording, and none is replaced without --force; give another name"
+            f"{path}: is a recording, which is replaced only with --force; give another name"
         )
 
 

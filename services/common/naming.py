@@ -36,9 +36,9 @@ def checked_identifier(text: str, option: str) -> str:
         raise InputError(f"{option}: {error}") from error
 
 
-def count_of(number: float, noun: str) -> str:
+def count_of(number: float, noun: str, plural: str = "") -> str:
     """Return a whole number with its noun in the right number: `1 truck`, `0 trucks`."""
-    return f"{number:.0f} {noun}{'' if number == 1 else 's'}"
+    return f"{number:.0f} {noun if number == 1 else plural or f'{noun}s'}"
 
 
 def processes_in_words(number: int) -> str:

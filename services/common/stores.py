@@ -170,7 +170,7 @@ def fetch(folder: Folder, name: str, to: Path) -> None:
 
 
 def _no_room(where: str, size: int, to: Path) -> str:
-    return f"{where}: {size / 1e6:.1f} MB have no room in {to.parent.parent} (TMPDIR)"
+    return f"{where}: {size / 1e6:.1f} MB do not fit in {to.parent.parent} (TMPDIR)"
 
 
 def put(folder: Folder, name: str, content: bytes) -> bool:
