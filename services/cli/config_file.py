@@ -104,6 +104,8 @@ def _checked(action: argparse.Action, where: str, value: str | float) -> str:
             parsed = action.type(text)
         except (argparse.ArgumentTypeError, ValueError) as error:
             raise InputError(f"{where}: {error}") from None
+    if isinstance(value, str) and isinstance(parsed, int | float):
+        raise InputError(f'{where}: is "{text}", it must be a number without quotes: {parsed:g}')
     if isinstance(parsed, str | Path) and not isinstance(value, str):
         raise InputError(f'{where}: is {value!r}, it must be a text in quotes: "{text}"')
     if action.choices is not None and text not in action.choices:

@@ -58,6 +58,10 @@ def test_command_line_overrides_an_alternative_of_the_file(tmp_path: Path) -> No
         ("realm = [7]", 'realm: is 7, it must be a text in quotes: "7"'),
         ('config = "x.toml"', "config: is unknown"),
         ('rotate_minutes = "x"', "rotate_minutes: is"),
+        (
+            'rotate_minutes = "5"',
+            'rotate_minutes: is "5", it must be a number without quotes: 5',
+        ),
         ("insecure = 1", "insecure: is 1, it must be true or false"),
         ('listen = ["a"]', "listen: is"),
         ("listen = true", "listen: is"),
