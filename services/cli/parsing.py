@@ -4,6 +4,7 @@ Nothing heavy is imported here: `driveby --help` does not wait for compilers and
 """
 
 import argparse
+import re
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -22,6 +23,9 @@ EXIT_SOMETHING_LOST: Final = 3
 
 Handler = Callable[[argparse.Namespace], int]
 """Type of a command's function, which returns the exit code."""
+
+_ONE_OF: Final = re.compile("one of the arguments (.+) is required")
+"""Error line of argparse if no option of an exclusive group is given."""
 
 
 _FORMER_OPTIONS: Final = {
@@ -80,7 +84,10 @@ class Parser(argparse.ArgumentParser):
         return self.former_options.get(option, option) + equals + value
 
     def error(self, message: str) -> NoReturn:
-        """Raise InputError."""
+        """Raise InputError; alternatives are joined by a word, which argparse leaves out."""
+        found = _ONE_OF.fullmatch(message)
+        if found is not None:
+            message = f"{' or '.join(found[1].split())} is required"
         raise InputError(f"{message} (see {self.prog} --help)")
 
 
