@@ -22,6 +22,7 @@ from services.common.files import check_writable, make_folder
 from services.common.language import ENGLISH
 from services.common.naming import count_of, processes_in_words
 from services.common.progress import progress_bar, start_line
+from services.common.road_class import assumed_road
 from services.common.truck_choice import TRUCK_CHOICES, truck_to_try
 from services.history.validation_files import frequent_reasons, save
 from services.simulation.trial_truth import CROSSINGS
@@ -106,9 +107,7 @@ def _pairs(known: Site, asked: CertificateOptions) -> list[VehicleBridgePair]:
     truck, bridge = asked.truck, asked.bridge
     for option, wanted, ids in (("--truck", truck, vehicles), ("--bridge", bridge, bridges)):
         if wanted is not None and wanted not in ids:
-            raise InputError(
-                f"{option}: {asked.site} has no {wanted}, it has {', '.join(ids[:20])}"
-            )
+            raise InputError(f"{option}: is {wanted}, {asked.site} has only {', '.join(ids[:20])}")
     return [
         VehicleBridgePair(v, b)
         for v in vehicles
@@ -130,16 +129,17 @@ def line_of(certificate: ValidationRecord, path: Path, known: Site) -> str:
     std = "" if figures.std is None else f"; EI ± {100.0 * figures.std:.0f} %"
     if std and certificate.conditions.road == "groove":
         std += _one_profile(known.vehicle(certificate.vehicle))
+    declared = known.bridge(certificate.bridge).road_class
     road = certificate.conditions.road_class
-    if known.bridge(certificate.bridge).road_class is None:
-        std += f"; assumed road class {road} (road_class in the site file)"
-    return f"{certificate.pair}: {how}{fewer}: {certificate.reason}{std}; {path}"
+    assumed = assumed_road(road, declared, "road_class in the site file")
+    std += assumed and f"; {assumed}"
+    return f"{certificate.pair}: {how}{after}: {certificate.reason}{std}; {path}"
 
 
 def _one_profile(vehicle: Vehicle) -> str:
     """Return the caution on a trial whose axles follow one profile, and what may be declared."""
     undeclared = [key for key in _UNLIKE_PATHS if getattr(vehicle, key) is None]
-    two = f"; to simulate two, declare {' or '.join(undeclared)}" if undeclared else ""
+    two = f"; to simulate two profiles, declare {' or '.join(undeclared)}" if undeclared else ""
     return (
         " on one road profile under both axles, so real crossings are less accurate (driveby "
         f"survey forecasts how accurate{two})"

@@ -18,13 +18,13 @@ from services.simulation.drive import (
     DrivenRoad,
     Measurement,
     OutOfModelEffects,
-    assumed_road,
     declared_site,
     densities_of,
     noise_density_of,
     paper_site,
     ratios_of,
     road_class_of,
+    road_note,
     simulate_drive,
     write_drives,
 )
@@ -102,7 +102,7 @@ def _simulate_plane(
     times = drives[0].run.accel_time_s
     console.print(
         f"{asked.output}: {schedule.in_words(times[-1] - times[0])}, {messages} messages"
-        f"{assumed_road(known, road_class)}",
+        f"{road_note(known, road_class)}",
         highlight=False,
     )
     return 0
@@ -131,7 +131,7 @@ def surface_of(asked: SimulateOptions) -> SurfaceOptions | None:
         return SurfaceOptions(asked.tyres, asked.rear_offset, asked.wander or 0.0, pavement)
     for name in _OF_SURFACE:
         if getattr(asked, name) is not None:
-            raise InputError(f"{option_of(name)}: only a --road-surface has it")
+            raise InputError(f"{option_of(name)}: has no effect without --road-surface")
     return None
 
 
@@ -142,7 +142,9 @@ def _with_tandem(asked: SimulateOptions, site: Site) -> Site | None:
         if asked.axles == 2:
             raise InputError(f"--axles: is 2, but {truck.id} has 3 axles")
         if asked.tyres:
-            raise InputError("--tyres: the site file has the tyres of its axles")
+            raise InputError(
+                "--tyres: the site file declares the tyres of each axle, leave the option out"
+            )
         return site
     if asked.axles != 3:
         return None

@@ -39,6 +39,7 @@ from schemas.site import Bridge, Densities, Site, Vehicle
 from schemas.site_file import parse_site, site_toml
 from services.common.arrays import Floats
 from services.common.errors import FailureError, InputError
+from services.common.road_class import assumed_road
 from services.drives.runs import Run, run_to_messages
 from services.recordings.writer import write_recording
 from services.simulation.lane import Twist
@@ -168,10 +169,10 @@ def road_class_of(site: Site, asked: str | None) -> str:
     return asked or site.bridges[0].road_class or "A"
 
 
-def assumed_road(site: Site, road_class: str) -> str:
+def road_note(site: Site, road_class: str) -> str:
     """Return a note on a road class that the site's first bridge does not declare, or ""."""
-    declared = site.bridges[0].road_class
-    return "" if road_class == declared else f"; assumed road class {road_class} (--road)"
+    assumed = assumed_road(road_class, site.bridges[0].road_class, "--road")
+    return assumed and f"; {assumed}"
 
 
 def declared_site(site: Site, noise_ug_per_rthz: float | Densities, rate_hz: float) -> Site:

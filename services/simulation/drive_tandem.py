@@ -18,7 +18,7 @@ from services.common.progress import steps_bar
 from services.drives.runs import run_to_messages
 from services.identification.footprints import footprints_of
 from services.recordings.writer import write_recording
-from services.simulation.drive import assumed_road
+from services.simulation.drive import road_note
 from services.simulation.schedule import ONCE, Schedule, begun_at
 from services.simulation.two_sided import Body, WideAxle, WideBogie, WideTruck
 from services.simulation.two_sided_deck import Deck, Torsion, bending_frequencies_hz
@@ -87,7 +87,7 @@ def simulate_tandem(
     times = runs[0].accel_time_s
     console.print(
         f"{output}: {how.schedule.in_words(times[-1] - times[0])}, {messages} messages"
-        f"{assumed_road(site, how.road[0])}",
+        f"{road_note(site, how.road[0])}",
         highlight=False,
     )
     return 0

@@ -36,6 +36,7 @@ from schemas.validation_records import (
     pair_hash,
 )
 from services.common.errors import FailureError
+from services.common.naming import count_of
 from services.drives.runs import Run
 from services.finding.placed import middle_sensor, middle_site
 from services.recordings.recording import program_version
@@ -359,36 +360,43 @@ def _against(
             continue
         worst = float(np.abs(errors_of(one).z).max())
         if worst > LARGEST_Z_GOOD:
+            element = int(np.abs(errors_of(one).z).argmax()) + 1
             return (
-                f"crossing {one.seed} is called good and is wrong by {worst:.1f} standard "
-                f"deviations, at most {LARGEST_Z_GOOD:g} are allowed"
+                f"the crossing of seed {one.seed} is good, but element {element} of it is wrong by "
+                f"{worst:.1f} standard deviations; at most {LARGEST_Z_GOOD:g} are allowed"
             )
         if one.weak_element is not None and _of_weak(one.ei_ratio_q025, one) > TAKEN_FOR_SOUND:
             return (
-                f"crossing {one.seed} is called good and takes element {one.weak_element}, of "
-                "half its rigidity, for a sound one"
+                f"the crossing of seed {one.seed} is good, but it takes element "
+                f"{one.weak_element}, which has lost half of its EI, for undamaged"
             )
     others = figures.crossings - figures.good
     if others > CROSSINGS - FEWEST_GOOD:
         return (
-            f"{figures.good} of {figures.crossings} crossings are good, at least {FEWEST_GOOD} of "
-            f"{CROSSINGS} must be ({_why_not(tried)})"
+            f"{figures.good} of {count_of(figures.crossings, 'crossing')} are good; at least "
+            f"{FEWEST_GOOD} of {CROSSINGS} must be ({_why_not(tried)})"
         )
     # All remaining intervals may contain the truth, with zero errors.
     to_come = (CROSSINGS - figures.crossings) * elements
     missed = figures.intervals - figures.covered
     if missed > (1.0 - LEAST_COVERAGE) * (figures.intervals + to_come):
         return (
-            f"{missed} of {figures.intervals} intervals (95 %) miss the truth, at most "
-            f"{100 * (1.0 - LEAST_COVERAGE):.0f} % may"
+            f"{missed} of {figures.intervals} intervals (95 %) of {_answered(tried)} miss the "
+            f"truth; at most {100 * (1.0 - LEAST_COVERAGE):.0f} % may"
         )
     squares = figures.intervals * (figures.rms_z or 0.0) ** 2
     if squares > LARGEST_RMS_Z**2 * (figures.intervals + to_come):
         return (
-            f"errors are {figures.rms_z:.2f} standard deviations (root mean square), at most "
+            f"errors are {figures.rms_z:.2f} standard deviations (root mean square of "
+            f"{count_of(figures.intervals, 'element')} in {_answered(tried)}); at most "
             f"{LARGEST_RMS_Z:g} are allowed"
         )
     return None
+
+
+def _answered(tried: Sequence[ValidationCrossing]) -> str:
+    """Return the number of crossings with intervals, in words."""
+    return count_of(sum(one.is_answered for one in tried), "crossing")
 
 
 def _why_not(tried: Sequence[ValidationCrossing]) -> str:
@@ -407,7 +415,8 @@ def _for(tried: Sequence[ValidationCrossing], figures: ValidationFigures) -> str
     """Return the figures of a trial that passed, each with its limit."""
     missed, allowed = figures.intervals - figures.covered, figures.most_missed
     others = _why_not(tried)
-    weak = f"; a weak element is detected in {figures.weak_found} of {figures.weak}"
+    of_weak = count_of(figures.weak, "crossing")
+    weak = f"; a weak element is detected in {figures.weak_found} of {of_weak}"
     return (
         f"{figures.good} of {figures.crossings} crossings are good{others and f', {others}'} (at "
         f"least {FEWEST_GOOD} of {CROSSINGS} must be good); {missed} of {figures.intervals} "

@@ -81,7 +81,9 @@ def wheel_paths_of(vehicle: Vehicle, asked: SurfaceOptions = USUAL) -> WheelPath
         ("--rear-offset", asked.rear_offset_m, "rear_axle_offset_m", offset_m),
     ):
         if wanted is not None and known is not None:
-            raise InputError(f"{option}: the site file has it, {vehicle.id} has {name}")
+            raise InputError(
+                f"{option}: {vehicle.id} declares {name} in the site file, leave the option out"
+            )
     behind = asked.tyres or "twin"
     if distance is not None:
         behind = "twin" if distance[1] > 0.0 else "single"

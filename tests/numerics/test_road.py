@@ -70,7 +70,7 @@ def test_class_and_iri_may_disagree_near_a_limit_as_the_glossary_says() -> None:
         both.append((iso_8608_class(roughness), iri_m_per_km(at_limit)[0]))
     assert any(name == "A" and iri > 3.1 for name, iri in both)
     (meaning,) = (one.meaning for one in ENGLISH.glossary if one.word.startswith("IRI"))
-    assert "near a limit both may disagree" in meaning
+    assert "Near a limit the two may disagree" in meaning
 
 
 def test_iri_of_a_measured_profile(

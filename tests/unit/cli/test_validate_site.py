@@ -117,8 +117,11 @@ def test_line_names_the_road_class_that_the_site_lacks(
 @pytest.mark.parametrize(
     ("declared", "two"),
     [
-        ({}, "; to simulate two, declare twin_tyre_distance_m or rear_axle_offset_m)"),
-        ({"twin_tyre_distance_m": (0.0, 0.0)}, "; to simulate two, declare rear_axle_offset_m)"),
+        ({}, "; to simulate two profiles, declare twin_tyre_distance_m or rear_axle_offset_m)"),
+        (
+            {"twin_tyre_distance_m": (0.0, 0.0)},
+            "; to simulate two profiles, declare rear_axle_offset_m)",
+        ),
         ({"twin_tyre_distance_m": (0.0, 0.0), "rear_axle_offset_m": 0.0}, ")"),
     ],
 )
@@ -174,8 +177,8 @@ def test_one_pair_may_be_asked_for(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--truck", "truck-9"), "--truck: {site} has no truck-9, it has truck-1, truck-2"),
-        (("--bridge", "b"), "--bridge: {site} has no b, it has bridge-1, bridge-2"),
+        (("--truck", "truck-9"), "--truck: is truck-9, {site} has only truck-1, truck-2"),
+        (("--bridge", "b"), "--bridge: is b, {site} has only bridge-1, bridge-2"),
         (("--json", "x.json"), "--json: only with --method"),
         (("--scenarios", "1"), "--scenarios: only with --method"),
         (("--noise", "25"), "--noise: only with --method"),

@@ -215,9 +215,9 @@ def test_tyres_are_the_sites_the_askers_or_common_ones() -> None:
     for asked, words in (
         (
             SurfaceOptions("twin"),
-            f"--tyres: the site file has it, {known.id} has twin_tyre_distance_m",
+            f"--tyres: {known.id} declares twin_tyre_distance_m in the site file",
         ),
-        (SurfaceOptions(None, 0.0), "--rear-offset: the site file has it, .* rear_axle_offset_m"),
+        (SurfaceOptions(None, 0.0), "--rear-offset: .* declares rear_axle_offset_m"),
     ):
         with pytest.raises(InputError, match=words):
             wheel_paths_of(known, asked)
@@ -292,6 +292,8 @@ def test_values_of_the_site_file_are_not_requested_again(
     options = ["--scenario", "6", "--site", str(site), "--road-surface", "-o", str(output)]
     assert cli.main(["simulate", *options, "--tyres", "twin"]) == 2
     error = capsys.readouterr().err
-    assert error.startswith("driveby: --tyres: the site file has it, ")
+    assert error.startswith(
+        "driveby: --tyres: truck-1 declares twin_tyre_distance_m in the site file, "
+    )
     assert error.count("\n") == 1
     assert not output.exists()

@@ -57,7 +57,7 @@ def test_case_is_the_nominal_truck_of_the_site() -> None:
         (["--air-springs", "1.4"], "--air-springs: is not simulated for a truck with a tandem"),
         (["--speed", "9:11"], "--speed: is START:END, it must be one speed"),
         (["--axles", "2"], "--axles: is 2, but tandem-truck has 3 axles"),
-        (["--tyres", "twin"], "--tyres: the site file has the tyres of its axles"),
+        (["--tyres", "twin"], "--tyres: the site file declares the tyres of each axle"),
     ],
 )
 def test_options_that_a_tandem_excludes_are_refused(

@@ -111,7 +111,7 @@ def test_pavement_without_a_surface_is_refused(
 ) -> None:
     asked = ["simulate", "--scenario", "1", *option, "-o", str(tmp_path / "a.mcap")]
     assert cli.main(asked) == 2
-    assert f"{option[0]}: only a --road-surface has it" in capsys.readouterr().err
+    assert f"{option[0]}: has no effect without --road-surface" in capsys.readouterr().err
 
 
 def test_command_simulates_a_pavement(tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def test_too_few_good_ones_fail_as_soon_as_that_is_sure() -> None:
     assert judge_trial(some) is None
     passed, reason = outcome(*some, made_up(9, verdict="not_found"))
     assert not passed
-    assert "0 of 5 crossings are good, at least 8 of 12" in reason
+    assert "0 of 5 crossings are good; at least 8 of 12" in reason
     assert "model_misfit" in reason
 
 
@@ -127,7 +127,7 @@ def test_intervals_that_miss_too_often_fail() -> None:
     some = [made_up(k, 2.1, 0.0, 0.0, 0.0, 0.0) for k in range(CROSSINGS)]
     passed, reason = outcome(*some)
     assert not passed
-    assert "intervals (95 %) miss the truth, at most 15 % may" in reason
+    assert "12 of 60 intervals (95 %) of 12 crossings miss the truth; at most 15 % may" in reason
     # 10 of 60 are more than 15 %, whatever comes after.
     assert judge_trial(some[:9]) is None
     assert judge_trial(some[:10]) is not None
@@ -137,14 +137,25 @@ def test_errors_that_are_too_large_fail() -> None:
     some = [made_up(k, 4.5, *[0.3] * 7) for k in range(CROSSINGS)]
     passed, reason = outcome(*some)
     assert not passed
-    assert "standard deviations (root mean square), at most 1.5" in reason
+    assert (
+        "standard deviations (root mean square of 96 elements in 12 crossings); at most 1.5"
+        in reason
+    )
+    # A single crossing may suffice, and the reason shows that it did.
+    suspect = made_up(0, *[9.0] * 4, verdict="suspect")
+    passed, reason = outcome(suspect, made_up(1, verdict="rejected"))
+    assert not passed
+    assert reason == (
+        "errors are 9.00 standard deviations (root mean square of 4 elements in 1 crossing); at "
+        "most 1.5 are allowed"
+    )
 
 
 def test_one_good_crossing_that_is_wrong_is_enough() -> None:
     assert judge_trial([made_up(0, 4.9)]) is None
     passed, reason = outcome(made_up(0, 5.1))
     assert not passed
-    assert "crossing 0 is called good and is wrong by 5.1" in reason
+    assert "the crossing of seed 0 is good, but element 1 of it is wrong by 5.1" in reason
     assert judge_trial([made_up(0, 5.1, verdict="suspect")]) is None
 
 
