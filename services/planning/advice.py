@@ -51,7 +51,7 @@ def tyres_of(outlook: PlanForecast) -> str:
     if vehicle.tandem is not None:
         return f"{'twin' if rear.twin_distance_m > 0.0 else 'single'} tyres on its tandem"
     if rear.twin_distance_m > 0.0:
-        return "twin tyres behind"
+        return "twin rear tyres"
     is_equal = rear._replace(offset_m=front.offset_m) == front
     return "equal single tyres" if is_equal else "single tyres"
 
@@ -62,10 +62,10 @@ def mismatch_in_words(found: SurveyForecast) -> str:
     front, rear = axles_of(vehicle)
     offset_mm = 1e3 * abs(rear.offset_m - front.offset_m)
     if vehicle.tandem is not None:
-        given = "" if has_declared_offset(vehicle) else " (no lateral_offset_m)"
+        given = "" if has_declared_offset(vehicle) else " (assumed, lateral_offset_m)"
         which = "offset of axle 3 from 2"
     else:
-        given = "" if has_declared_offset(vehicle) else " (no rear_axle_offset_m)"
+        given = "" if has_declared_offset(vehicle) else " (assumed, rear_axle_offset_m)"
         which = "rear axle offset"
     return f"{which} {offset_mm:g} mm{given}, lateral wander {found.road.wander_m:g} m"
 
@@ -242,15 +242,16 @@ def warnings(found: SurveyForecast) -> Iterator[str]:
     of_bridge = (f for f in findings_of_bridge(site.bridges[0]) if f.name != "survey_speed")
     for finding in (*of_site, *of_bridge):
         if finding.state is not CheckStatus.OK:
-            yield f"{finding.text}: {finding.advice}"
+            yield f"{finding.text}; {finding.advice}"
     slowest = min(found.question.speed_m_per_s, found.question.speeds_m_per_s[0])
     if slowest < SLOWEST_M_PER_S:
         yield (
-            f"speeds from {slowest:g} m/s: below {SLOWEST_M_PER_S:g} m/s a crossing is rejected, "
-            "drive at 5 m/s or more"
+            f"speeds begin at {slowest:g} m/s; below {SLOWEST_M_PER_S:g} m/s a crossing is "
+            "rejected, so drive at 5 m/s or more"
         )
     if found.compared_m < SHORTEST_APPROACH_M:
         yield (
-            f"at {found.question.speed_m_per_s:g} m/s {found.compared_m:.0f} m of road before and "
-            f"after the bridge are compared, {SHORTEST_APPROACH_M:g} m are needed: drive faster"
+            f"at {found.question.speed_m_per_s:g} m/s only {found.compared_m:.0f} m of road before "
+            f"and after the bridge are compared, but {SHORTEST_APPROACH_M:g} m are needed; drive "
+            "faster"
         )

@@ -36,6 +36,14 @@ TANDEM: Final = "a truck with an equalised tandem"
 _OTHER_WAY = "half of the runs the other way"
 _MOVED_LOAD = "load moved to the heavier axle"
 _QUIET_SENSORS = "sensors of a quarter of the noise"
+_TWO_AXLES = "a lorry of two axles"
+_LABELS: Final = {
+    _OTHER_WAY: "half in the other direction",
+    _QUIET_SENSORS: "sensors with 1/4 of the noise",
+    f"{_TWO_AXLES}, twin tyres behind": "a two-axle truck, twin rear tyres",
+    f"{_TWO_AXLES}, equal single tyres": "a two-axle truck, equal single tyres",
+}
+"""Names as printed; JSON keeps those of the first version."""
 
 
 class Plan(NamedTuple):
@@ -47,7 +55,7 @@ class Plan(NamedTuple):
     @property
     def label(self) -> str:
         """Name as printed: JSON keeps that of the first version."""
-        return "half in the other direction" if self.name == _OTHER_WAY else self.name
+        return _LABELS.get(self.name, self.name)
 
     @property
     def cost(self) -> int:
@@ -117,7 +125,7 @@ def _other_trucks(site: Site) -> Iterator[tuple[str, Site]]:
         if front.twin_distance_m > 0.0:
             yield "single tyres on the tandem", with_tyres(site, "single")
         for name, tyres in (("twin tyres behind", "twin"), ("equal single tyres", "single")):
-            yield f"a lorry of two axles, {name}", _with_vehicle(site, usual_lorry(tyres))
+            yield f"{_TWO_AXLES}, {name}", _with_vehicle(site, usual_lorry(tyres))
         return
     if not is_equal or front.twin_distance_m > 0.0:
         yield EQUAL_TYRES, with_tyres(site, "single")

@@ -83,7 +83,7 @@ def _assumptions(found: SurveyForecast) -> str:
             f"{site.vehicles[0].total_mass_kg / 1e3:.1f} t",
             tyres_of(found.planned),
             f"{found.question.speed_m_per_s:g} m/s",
-            f"road of class {found.road.road_class}",
+            f"road class {found.road.road_class}",
             f"sensors of {noise:g} µg/√Hz",
         )
     )

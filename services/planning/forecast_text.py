@@ -6,6 +6,8 @@ from typing import Any
 
 from pre_core.constants import DETECTION_PROBABILITY
 from pre_core.survey.detection import FALSE_ALARM
+from services.common.naming import count_of
+from services.common.road_class import assumed_road
 from services.identification.comparison import CLEAR_LOSS
 from services.planning.advice import advice, mismatch_in_words, percent, tyres_of, warnings
 from services.planning.crossings import scale_error
@@ -74,12 +76,13 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     question, planned = found.question, found.planned
     vehicle, bridge = planned.plan.site.vehicles[0], planned.plan.site.bridges[0]
     speeds = [crossing.speed_m_per_s for crossing in planned.plan.tracks[0]]
-    assumed = "" if found.road.road_class == bridge.road_class else " (assumed, --road)"
+    road = found.road.road_class
+    road = assumed_road(road, bridge.road_class, "--road") or f"road class {road}"
     tonnes = vehicle.total_mass_kg / 1e3
     yield f"{vehicle.id} ({tonnes:.1f} t, {tyres_of(planned)}) over {bridge.id}"
     yield (
-        f"({bridge.span_m:g} m, {bridge.elements} elements), road of class "
-        f"{found.road.road_class}{assumed}, {question.crossings} crossings"
+        f"({bridge.span_m:g} m, {bridge.elements} elements), {road}, "
+        f"{count_of(question.crossings, 'crossing')}"
     )
     halves = ", ".join(f"half at {speed:.1f} m/s" for speed in speeds)
     yield f"assumed speeds: {halves}"
@@ -93,32 +96,12 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
         f"overall stiffness: ± {_percent(planned.once.level_std)} after 1 crossing, "
         f"± {_percent(planned.expected.level_std)} after {question.crossings}"
     )
-    yield "±: standard deviation of EI; near 55 % the measurement adds nothing; seen:"
-    yield "probability that the loss is detected against the nominal value; vs others:"
-    wanted = percent(DETECTION_PROBABILITY)
-    yield "against the others; next to supports, whose springs are unknown, less is seen"
-    yield "against the nominal value than the same ± elsewhere suggests;"
-    yield f"smallest: loss that is detected with {wanted} probability"
-    yield f"detected: by a one-sided test with {false} false alarms"
-    yield f"clear: loss that a report calls clear with {wanted} probability: the whole 95 %"
-    yield f"interval is more than {percent(CLEAR_LOSS)} below the other elements"
-    yield f"two surveys of {question.crossings} crossings compared: √2 times the ± of one, so each"
-    yield "needs at least twice the crossings stated here, and more for a clear change"
+    yield from _legend_of_elements(question.crossings)
     yield ""
     yield from _aligned(_comparison(found))
-    yield f"after {question.crossings} crossings; overall, mid: standard deviations of the overall"
-    yield "stiffness and of EI at midspan; smallest: at midspan; needed, ends: crossings"
-    yield f"until the loss is detected with {wanted} probability at midspan; at both ends"
-    yield "(elsewhere between the two numbers); clear: until a report calls the loss at"
-    yield f"midspan clear; –: more than {MAX_CROSSINGS};"
-    yield f"midspan: EI_{found.planned.middle + 1}, at the middle of the longest span;"
-    yield "equal single tyres: on equal tracks, to a centimetre;"
-    yield "at … t: at most 18 t, with three axles 26 t, as in the EU; national limits may"
-    yield "be lower;"
-    yield "in the other direction: in the opposite lane;"
-    yield "… elements: fewer, longer ones;"
-    if found.speeds:
-        yield "at … m/s: all runs at one speed; needed, ends and clear not computed;"
+    yield from _legend_of_changes(
+        question.crossings, planned.middle + 1, has_speeds=bool(found.speeds)
+    )
     yield from _not_advised(found)
     yield ""
     for line in warnings(found):
@@ -126,13 +109,49 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     yield advice(found)
 
 
+def _legend_of_elements(crossings: int) -> Iterator[str]:
+    """Yield a line for each column of the first table, and how to read all of them."""
+    wanted = percent(DETECTION_PROBABILITY)
+    yield "±          standard deviation of EI; near 55 % the measurement adds nothing"
+    yield "seen       probability that the loss is detected against the nominal value"
+    yield "vs others  probability that the loss is detected against the other elements"
+    yield f"smallest   smallest loss that is detected with {wanted} probability"
+    yield f"clear      smallest loss that a report calls clear with {wanted} probability:"
+    yield f"           the whole 95 % interval is more than {percent(CLEAR_LOSS)} below the others"
+    yield f"detected   by a one-sided test with {percent(FALSE_ALARM)} false alarms"
+    yield "Next to supports, whose restraint is unknown, less is seen against the nominal"
+    yield "value than the same ± elsewhere suggests."
+    yield f"Two compared surveys of {crossings} crossings have √2 times the ± of one, so each needs"
+    yield "at least twice the crossings stated here, and more for a clear change."
+
+
+def _legend_of_changes(crossings: int, middle: int, *, has_speeds: bool) -> Iterator[str]:
+    """Yield a line for each column and row of the second table."""
+    wanted = percent(DETECTION_PROBABILITY)
+    yield f"overall    standard deviation of the overall stiffness after {crossings} crossings"
+    yield "mid        standard deviation of EI at midspan; smallest is there, too"
+    yield f"needed     crossings that detect the loss at midspan with {wanted} probability"
+    yield "ends       crossings that detect it at both ends; other elements lie in between"
+    yield "clear      crossings after which a report calls the loss at midspan clear"
+    yield f"–          more than {MAX_CROSSINGS} crossings"
+    yield f"midspan: EI_{middle}, at the middle of the longest span"
+    yield "equal single tyres: on tracks that are equal to a centimetre"
+    yield "at … t: at most 18 t, with three axles 26 t, as in the EU; national limits may"
+    yield "        be lower"
+    yield "in the other direction: in the opposite lane"
+    yield "… elements: fewer, longer ones"
+    if has_speeds:
+        yield "at … m/s: all runs at one speed; needed, ends and clear are not computed"
+
+
 def _not_advised(found: SurveyForecast) -> Iterator[str]:
     """Yield which rows the advice leaves out, and why."""
     if found.planned.plan.site.vehicles[0].tandem is None:
-        yield "the advice does not rank tandems, whose forecast is too optimistic, nor"
-        yield "fewer elements, as a loss in one of them is more damage"
+        yield "The advice does not rank tandems, whose forecast is too optimistic, nor fewer"
+        yield "elements, because a loss in a longer element is more damage."
     else:
-        yield "the advice leaves out fewer elements, as a loss in one is more damage"
+        yield "The advice does not rank fewer elements, because a loss in a longer element is"
+        yield "more damage."
 
 
 def _aligned(rows: list[list[str]]) -> Iterator[str]:
@@ -193,7 +212,7 @@ def _comparison(found: SurveyForecast) -> list[list[str]]:
         for at in found.speeds
     ]
     if found.rougher is not None:
-        name = f"road of class {chr(ord(found.road.road_class) + 1)}"
+        name = f"road class {chr(ord(found.road.road_class) + 1)}"
         rows.append(_cells(found.rougher, name))
     return rows
 

@@ -14,8 +14,10 @@ from services.common.options import number, opt, output_option, site_option, who
 
 def _speeds(text: str) -> tuple[float, float]:
     speed = number("a speed in m/s (or SLOWEST:FASTEST)", low=1, high=50)
-    low, _, high = text.partition(":")
-    found = speed(low), speed(high if ":" in text else low)
+    low, colon, high = text.partition(":")
+    if ":" in high:
+        raise argparse.ArgumentTypeError(f'is "{text}", it must be SLOWEST:FASTEST')
+    found = speed(low), speed(high if colon else low)
     if found[1] < found[0]:
         raise argparse.ArgumentTypeError(f'is "{text}", it must be SLOWEST:FASTEST')
     return found

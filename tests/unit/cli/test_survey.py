@@ -59,7 +59,7 @@ def test_a_plan_of_the_example(
     assert growth[planned["crossings"]] == whole
     best = "equal single tyres on both axles, on equal tracks to a centimetre"
     assert best in plan["advice"]
-    assert "\nequal single tyres: on equal tracks, to a centimetre;\n" in out
+    assert "\nequal single tyres: on tracks that are equal to a centimetre\n" in out
     assert plan["advice"] in out
     assert "tyres are not declared" in out
     assert plan["speeds"] == []
@@ -116,7 +116,7 @@ def made_up(needed: int | None, others: dict[str, float], speed: float = 10.0) -
 def test_the_advice_names_what_helps_most() -> None:
     found = made_up(9, {"a trailer": 0.19, "two trucks": 0.1, "a slower truck": 0.15})
     text = advice(found)
-    assert text.startswith("9 crossings at 10 m/s with twin tyres behind detect a 20 % loss")
+    assert text.startswith("9 crossings at 10 m/s with twin rear tyres detect a 20 % loss")
     assert "the ends would take more than 300" in text
     assert "What helps most: two trucks; then 4 crossings detect it, and the ends need 60." in text
     assert "Next best: a slower truck" in text
@@ -243,7 +243,7 @@ def test_the_loss_that_a_report_calls_clear_is_forecast() -> None:
     """It is the report's own figure for a survey that is as accurate as forecast."""
     lines = list(lines_of(made_up(9, {})))
     assert lines[6].endswith("smallest  clear")
-    assert "the whole 95 % interval is more than 10 % below the other elements" in " ".join(lines)
+    assert "the whole 95 % interval is more than 10 % below the others" in " ".join(lines)
     (clear,) = clear_loss_detectable(np.array([1.96 * 0.05]))
     ratio, high = 1.0 - clear, (1.0 - clear) * np.exp(1.96 * 0.05)
     loss = Element(1, 0.0, 5.0, ratio, 0.5, high).detectable_loss
@@ -264,7 +264,7 @@ def test_picture_names_bridge_truck_and_threshold() -> None:
 
 def test_forecast_says_what_a_comparison_of_two_surveys_takes() -> None:
     text = " ".join(lines_of(made_up(9, {})))
-    assert "two surveys of 12 crossings compared: √2 times the ± of one" in text
+    assert "Two compared surveys of 12 crossings have √2 times the ± of one" in text
     assert "so each needs at least twice the crossings stated here" in text
 
 
@@ -274,10 +274,10 @@ def test_forecast_of_a_declared_road_assumes_none() -> None:
     bridge = site.bridges[0].model_copy(update={"road_class": "A"})
     plan = as_planned(site.model_copy(update={"bridges": (bridge,)}), 10.0)
     text = "\n".join(lines_of(found._replace(planned=found.planned._replace(plan=plan))))
-    assert "road of class A, 12 crossings\n" in text
+    assert "road class A, 12 crossings\n" in text
 
 
 def test_forecast_prints_the_speeds_it_assumes() -> None:
     text = "\n".join(lines_of(made_up(9, {})))
-    assert "road of class A (assumed, --road), 12 crossings\n" in text
+    assert "assumed road class A (--road), 12 crossings\n" in text
     assert "\nassumed speeds: half at 8.5 m/s, half at 11.5 m/s\n" in text

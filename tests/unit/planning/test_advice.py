@@ -127,10 +127,11 @@ def test_free_change_comes_before_better_sensors() -> None:
     found = forecast((None, None, 0.5), **rows)
     assert (
         f"What helps at no cost: {loaded}; then 12 crossings detect a loss of 40 %. "
-        f"What helps more: {quiet} (then 20 crossings detect it"
+        "What helps more: sensors with 1/4 of the noise (then 20 crossings detect it"
     ) in advice(found)
     weak = forecast((None, None, 0.5), **(rows | {quiet: (None, None, 0.45)}))
-    assert f"Next best: {quiet} (then 12 crossings detect a loss of 45 %)." in advice(weak)
+    quiet_label = "sensors with 1/4 of the noise"
+    assert f"Next best: {quiet_label} (then 12 crossings detect a loss of 45 %)." in advice(weak)
 
 
 def test_other_tyres_come_before_better_sensors() -> None:
@@ -138,7 +139,7 @@ def test_other_tyres_come_before_better_sensors() -> None:
     rows: dict[str, Any] = {quiet: (20, None, 0.3), tyres: (40, None, 0.3)}
     found = forecast((None, None, 0.5), **rows)
     assert f"What helps at the least cost: {tyres}, on equal tracks" in advice(found)
-    assert f"What helps more: {quiet} (" in advice(found)
+    assert "What helps more: sensors with 1/4 of the noise (" in advice(found)
 
 
 def test_speed_that_helps_is_a_free_change() -> None:
@@ -185,7 +186,7 @@ def key(row: Row) -> tuple[float, float, float]:
 
 def test_table_names_the_rows_without_advice() -> None:
     text = " ".join(lines_of(forecast((9, 40, 0.2))))
-    assert "the advice does not rank tandems, whose forecast is too optimistic, nor fewer" in text
+    assert "The advice does not rank tandems, whose forecast is too optimistic, nor fewer" in text
 
 
 @pytest.mark.parametrize("twin_m", [0.33, 0.0])
@@ -216,4 +217,4 @@ def test_tandem_that_does_not_help_is_not_advised() -> None:
 
 def test_legend_says_why_equal_deviations_are_seen_unequally() -> None:
     text = " ".join(lines_of(forecast((9, 40, 0.2))))
-    assert "next to supports, whose springs are unknown, less is seen" in text
+    assert "Next to supports, whose restraint is unknown, less is seen" in text
