@@ -11,6 +11,7 @@ from pre_core.physics.simulate import Motion
 from schemas.reasons import REASON_TEXTS, Reason
 from schemas.site import Sensor, Vehicle
 from services.common.arrays import Floats
+from services.common.naming import count_of
 from services.finding import placed
 from services.finding.placed import rates_hz
 from services.identification import signal_checks
@@ -37,8 +38,8 @@ def check_presence(run: InspectedRun, vehicle: Vehicle) -> Iterator[CheckFinding
         yield CheckFinding(
             "channels_unknown",
             CheckStatus.WRONG,
-            f"{', '.join(unknown)} recorded, not in the site file",
-            "name every accelerometer in [[vehicle.sensors]]: one that is not named is not used",
+            f"{', '.join(unknown)} recorded, but not in the site file",
+            "name every accelerometer in [[vehicle.sensors]]: others are not used",
         )
     there = len(vehicle.channels) - len(missing)
     yield check_finding(
@@ -59,7 +60,7 @@ def rates(run: InspectedRun, sensor: Sensor, vehicle: Vehicle) -> Iterator[Check
         yield check_finding(
             "sampling_rate",
             f"{name}: {rate:.1f} samples a second, {declared:g} declared",
-            "declare the rate that the sensor is set to, or set it",
+            "declare the sensor's rate, or set the sensor to the declared one",
             is_wrong=abs(rate / declared - 1.0) > _LARGEST_RATE_ERROR,
         )
 
@@ -72,8 +73,8 @@ def gaps(run: InspectedRun) -> CheckFinding:
     longest_s = _longest(np.asarray(holes)) / run.samples.rate_hz
     return check_finding(
         "gaps",
-        f"{100.0 * holes.mean():.2f} % of the samples missing, {run.missing_batches} batches lost, "
-        f"longest gap {longest_s:.2f} s",
+        f"{100.0 * holes.mean():.2f} % of the samples missing, "
+        f"{count_of(run.missing_batches, 'batch', 'batches')} lost, longest gap {longest_s:.2f} s",
         "check logger and cables: a gap on the bridge rejects the crossing",
         is_wrong=bool(holes.any()),
     )
@@ -95,35 +96,36 @@ def check_signals(
             yield CheckFinding(
                 "channel_stuck",
                 CheckStatus.WRONG,
-                f"{name}: one value for {held_s:.2f} s",
-                "it is dead: check plug and supply",
+                f"{name}: constant for {held_s:.2f} s",
+                "the sensor does not measure: check its plug and power supply",
             )
         elif abs(mean) > signal_checks.LARGEST_MEAN_M_PER_S2:
             yield CheckFinding(
                 "channel_biased",
                 CheckStatus.WRONG,
                 f"{name}: mean {mean:.2f} m/s²",
-                "is gravity included? declare gravity_included and up in [sensor], or repair it",
+                "if gravity is included, declare gravity_included and up in [sensor]; otherwise "
+                "repair the sensor",
             )
         elif _is_saturated(values):
             yield CheckFinding(
                 "sensor_saturated",
                 CheckStatus.WRONG,
-                f"{name}: values pile up at an end, {np.abs(values).max():.1f} m/s²",
-                "set a larger range",
+                f"{name}: saturated at {np.abs(values).max():.1f} m/s²",
+                "set the sensor to a larger range",
             )
         elif (spikes := quality.spikes(values, signal_checks.SPIKE_HEIGHT)) > 0:
             yield CheckFinding(
                 "signal_spikes",
                 CheckStatus.WRONG,
-                f"{name}: {spikes} single samples far off",
+                f"{name}: {count_of(spikes, 'single sample')} far from the neighbours",
                 "check cables and shielding",
             )
         else:
             yield CheckFinding(
                 "channel_alive",
                 CheckStatus.OK,
-                f"{name}: alive, mean {mean:+.3f}, largest {np.abs(values).max():.2f} m/s²",
+                f"{name}: mean {mean:+.3f} m/s², largest value {np.abs(values).max():.2f} m/s²",
             )
     if len(names) > 1 and quality.smallest_difference(acceleration) < signal_checks.ALIKE:
         yield CheckFinding(
@@ -191,11 +193,11 @@ def check_assignment(
             "channel_inverted",
             CheckStatus.WRONG,
             _inverted(found, names),
-            "turn it, or declare `up` in [sensor]",
+            "turn the sensor, or declare `up` in [sensor]",
         )
     return check_finding(
         "channels_in_place",
-        f"the axles' motion explains {100.0 * explained:.0f} % of the body's",
+        f"the axles' motion explains {100.0 * explained:.0f} % of the body's motion",
         "springs, masses or sensors are not those of the site file",
         is_wrong=found.recorded > signal_checks.MAX_UNEXPLAINED,
     )
@@ -252,7 +254,8 @@ def _swapped(found: quality.ChannelAssignment, names: tuple[str, ...]) -> str:
         for k in range(4)
         if found.best_order[k] != k
     ]
-    return f"{100.0 * found.recorded:.0f} % of the body's motion unexplained: {', '.join(pairs)}"
+    share = f"{100.0 * found.recorded:.0f} % of the body's motion is unexplained"
+    return f"{share}, and {', '.join(pairs)}"
 
 
 def _inverted(found: quality.ChannelAssignment, names: tuple[str, ...]) -> str:
@@ -280,9 +283,9 @@ def wheelbase(
     apart = abs(found.wheelbase_m - vehicle.wheelbase_m)
     return check_finding(
         "wheelbase",
-        f"the rear axle follows {found.wheelbase_m:.2f} m behind the front one, wheelbase_m "
+        f"the rear axle follows {found.wheelbase_m:.2f} m behind the front one, wheelbase_m is "
         f"{vehicle.wheelbase_m:g}",
-        "measure the wheelbase; is it this truck?",
+        "measure the wheelbase, and make sure that it was this truck",
         is_wrong=apart > max(_OTHER_WHEELBASE_M, _OTHER_WHEELBASE * vehicle.wheelbase_m),
     )
 
@@ -293,15 +296,15 @@ def masses(vehicle: Vehicle, acceleration: Floats, step_s: float) -> Iterator[Ch
     found = quality.stiffness_per_mass(acceleration, step_s, declared, damping)
     for end, measured, known in zip(("front", "rear"), found, declared.tolist(), strict=True):
         text = (
-            f"{end}: k/m of the body {measured:.0f} 1/s² by its motion, "
-            f"{known:.0f} by the site file"
+            f"{end}: stiffness over mass of the body {measured:.0f} 1/s² from its motion, "
+            f"{known:.0f} 1/s² from the site file"
         )
         if measured > _LARGEST_FACTOR * known:
             yield CheckFinding(
                 "spring_over_mass",
                 CheckStatus.OPEN,
                 text,
-                "friction in leaf springs looks like that; without it, weigh both axles",
+                "friction in leaf springs may cause this; for other springs, weigh both axles",
             )
         else:
             yield check_finding(

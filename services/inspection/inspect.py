@@ -77,7 +77,7 @@ def inspect(
     sites = [path for path in paths if path.suffix == ".toml"]
     recordings = [path for path in paths if path.suffix != ".toml"]
     if len(sites) > 1:
-        raise InputError(f"{sites[1]}: a second site file, give one and recordings")
+        raise InputError(f"{sites[1]}: is a second site file; give one site file, then recordings")
     given = _text_of(sites[0]) if sites else None
     if given is not None:
         yield _of_site(given)
@@ -102,11 +102,11 @@ def site_text_beside(path: Path) -> SiteText:
     if path.is_dir():
         site_path = path / "site.toml"
         if not site_path.is_file():
-            raise InputError(f"{path}: holds no site.toml, give a site file before it")
+            raise InputError(f"{path}: holds no site.toml; give a site file before the folder")
         return _text_of(site_path)
     text = read_info(path, lambda message: None).site_toml
     if text is None:
-        raise InputError(f"{path}: holds no site file, give one before it")
+        raise InputError(f"{path}: holds no site file; give one before the recording")
     return SiteText(text, f"{path}: site.toml")
 
 
@@ -129,7 +129,7 @@ def findings_of_run(run: InspectedRun, site: Site) -> Iterator[CheckFinding]:
             "vehicle",
             CheckStatus.WRONG,
             f"{run.vehicle} is not in the site file",
-            f"it knows {', '.join(known)}: name the truck as there",
+            f"the site file has {', '.join(known)}; use one name for the truck",
         )
         return
     vehicle = known[run.vehicle]
@@ -185,8 +185,9 @@ def _of_signals(
         yield CheckFinding(
             "channels_in_place",
             CheckStatus.OPEN,
-            f"order and signs of the channels: no {_SHORTEST_DRIVE_S:g} s of driving without gaps",
-            "check again with ten seconds of driving",
+            "order and signs of the channels were not checked, as no "
+            f"{_SHORTEST_DRIVE_S:g} s of driving are without gaps",
+            f"check again with {_SHORTEST_DRIVE_S:g} s of driving",
         )
     else:
         yield from _of_motion(run, vehicle, samples, drove, middle_of(vehicle, part))

@@ -46,6 +46,7 @@ def noise_of(name: str, still: NoiseSegment | None, declared_ug: float) -> Check
         f"{name}: noise {noise:.3g} µg/√Hz {where}, {declared_ug:g} declared",
         "declare the measured value, or check for a loose mount, a cable or another sensor"
         if ratio > 1.0
-        else "declare the measured value: intervals are too wide, and a misfit is hidden",
+        else "declare the measured value; too much declared noise widens intervals and hides a "
+        "misfit",
         is_wrong=not _QUIETER <= ratio <= loudest,
     )

@@ -22,6 +22,12 @@ _LANE_M: Final = 6.0
 It is larger for a poor receiver.
 """
 _LARGEST_ANGLE_DEG: Final = 4.0
+_INCOMPLETE: Final = {
+    Passage.TURNED_BACK: "the truck turned back on the bridge",
+    Passage.BEGINS_ON_BRIDGE: "the recording begins on the bridge",
+    Passage.ENDS_ON_BRIDGE: "the recording ends on the bridge",
+}
+"""Clause on a stay that is no whole crossing."""
 
 
 class CrossingTrack(NamedTuple):
@@ -61,7 +67,7 @@ def _not_crossed(
         return CheckFinding(
             "bridge_crossed",
             CheckStatus.WRONG,
-            f"{bridge.id}: the recording {stays[0].passage.value}",
+            f"{bridge.id}: {_INCOMPLETE[stays[0].passage]}",
             "record from before the bridge until after it, without stopping",
         )
     beside = np.flatnonzero((chainage > 0.0) & (chainage < bridge.span_m))
@@ -81,16 +87,15 @@ def _not_crossed(
         return CheckFinding(
             "bridge_place",
             CheckStatus.WRONG,
-            f"{bridge.id}: the path ends {nearest:.0f} m from its {side} and does not reach over "
-            "it",
-            "record the whole passage, or correct the coordinates of the bearings",
+            f"{bridge.id}: the path ends {nearest:.0f} m from its {side} and does not cross it",
+            "record the whole crossing, or correct the coordinates of the bearings",
         )
     return CheckFinding(
         "bridge_crossed",
         CheckStatus.OPEN,
-        f"{bridge.id}: not driven over here"
+        f"{bridge.id}: not crossed in this recording"
         + (f", nearest fix {nearest / 1e3:.1f} km away" if np.isfinite(nearest) else ""),
-        "check again with a crossing of it",
+        "check again with a recording of a crossing",
     )
 
 
@@ -141,19 +146,19 @@ def _findings_of_track(
     limit = max(_LANE_M, 3.0 * receiver.position_spread_m)
     yield check_finding(
         "bridge_lateral",
-        f"{where}: wheel path {abs(track.lateral_m):.1f} m from the line between its bearings",
+        f"{where}: wheel path {abs(track.lateral_m):.1f} m from the line between the bearings",
         "correct the coordinates of the bearings, or declare the receiver's position_spread_m",
         is_wrong=abs(track.lateral_m) > limit,
     )
     yield check_finding(
         "bridge_angle",
-        f"{where}: path at {abs(track.angle_deg):.1f}° to its line",
-        "correct the coordinates of the bearings: the line must be the one that is driven",
+        f"{where}: wheel path at {abs(track.angle_deg):.1f}° to the line between the bearings",
+        "correct the coordinates of the bearings: the truck drives along that line",
         is_wrong=abs(track.angle_deg) > _LARGEST_ANGLE_DEG,
     )
     yield check_finding(
         "crossing_speed",
-        f"{where}: {track.speed_m_per_s:.1f} m/s",
+        f"{where}: speed {track.speed_m_per_s:.1f} m/s",
         "drive at 5 m/s or more",
         is_wrong=track.speed_m_per_s < SLOWEST_M_PER_S,
     )
@@ -165,7 +170,8 @@ def _findings_of_track(
     ):
         yield check_finding(
             name,
-            f"{where}: {have_m:.0f} m recorded {side} it, of {want_m:.0f} m wanted",
+            f"{where}: {have_m:.0f} m of road recorded {side} the bridge, up to "
+            f"{want_m:.0f} m can be used",
             f"record more road {side} the bridge: the profile mismatch is measured there",
             is_wrong=have_m < _SHORT * want_m,
         )

@@ -8,6 +8,7 @@ import numpy as np
 from schemas.site import Receiver
 from services.common.arrays import Floats
 from services.common.geodesy import on_plane_m
+from services.common.naming import count_of
 from services.finding.stays import STANDING_M_PER_S
 from services.identification.methods import LONGEST_SURE_OUTAGE_S
 from services.inspection.finding import CheckFinding, CheckStatus, check_finding
@@ -35,15 +36,15 @@ def receiver_of(run: InspectedRun, declared: Receiver) -> Iterator[CheckFinding]
         yield CheckFinding(
             "positions",
             CheckStatus.WRONG,
-            f"{time_s.size} fixes, at least {_FEWEST_FIXES} are needed here",
+            f"{count_of(time_s.size, 'fix', 'fixes')}, at least {_FEWEST_FIXES} are needed",
             "record longer, or check receiver and antenna: crossings are detected by the positions",
         )
         return
     apart_s = float(np.median(np.diff(time_s)))
     yield check_finding(
         "position_rate",
-        f"{1.0 / apart_s:.3g} fixes a second",
-        "set the receiver to 1 Hz or more, better 10",
+        f"fixes at {1.0 / apart_s:.3g} Hz",
+        "set the receiver to 1 Hz or more, better to 10 Hz",
         is_wrong=1.0 / apart_s < _LOWEST_RATE_HZ,
     )
     longest_s = float(np.diff(time_s).max())
@@ -79,7 +80,7 @@ def _jumps(time_s: Floats, x: Floats, y: Floats, speed: Floats, declared: Receiv
     count = int(np.count_nonzero(jumps > limit))
     return check_finding(
         "position_jumps",
-        f"{count} jumps of the position"
+        f"{count_of(count, 'jump')} of the position"
         + (f", the largest by {jumps.max():.1f} m" if count else ""),
         "check the antenna's view; a jump at a bridge spoils the trajectory",
         is_wrong=count > 0,
@@ -98,9 +99,9 @@ def _position_noise(x: Floats, y: Floats, declared: Receiver) -> CheckFinding:
     noise = float(np.hypot(_white(x), _white(y)) / np.sqrt(2.0))
     return check_finding(
         "position_noise",
-        f"positions scatter by {noise:.2f} m from fix to fix, position_noise_m "
+        f"positions scatter by {noise:.2f} m from fix to fix, position_noise_m is "
         f"{declared.position_noise_m:g}",
-        "declare it in [receiver], or check the antenna",
+        "declare position_noise_m in [receiver], or check the antenna",
         is_wrong=noise > _MAX_NOISE * max(declared.position_noise_m, 0.01),
     )
 
@@ -109,8 +110,9 @@ def _speed_noise(speed: Floats, declared: Receiver) -> CheckFinding:
     noise = _white(speed)
     return check_finding(
         "speed_noise",
-        f"speeds scatter by {noise:.3f} m/s, speed_noise_m_per_s {declared.speed_noise_m_per_s:g}",
-        "declare it in [receiver]",
+        f"speeds scatter by {noise:.3f} m/s, speed_noise_m_per_s is "
+        f"{declared.speed_noise_m_per_s:g}",
+        "declare speed_noise_m_per_s in [receiver]",
         is_wrong=noise > _MAX_NOISE * max(declared.speed_noise_m_per_s, 0.003),
     )
 
@@ -132,7 +134,7 @@ def clocks(run: InspectedRun) -> Iterator[CheckFinding]:
             yield check_finding(
                 "clock_drift",
                 f"{name}: the truck's clock drifts by {1e6 * drift:+.1f} ppm",
-                "check the logger's clock: accelerations and positions would drift apart",
+                "check the truck's clock: accelerations and positions drift apart",
                 is_wrong=abs(drift) > _LARGEST_DRIFT,
             )
     if len(usable) == len(run.clocks):
@@ -141,7 +143,7 @@ def clocks(run: InspectedRun) -> Iterator[CheckFinding]:
         yield check_finding(
             "clock_offset",
             f"clocks of accelerations and positions {apart_s * 1e3:.1f} ms apart",
-            "stamp both by one clock",
+            "take both time stamps from one clock",
             is_wrong=apart_s > _LARGEST_OFFSET_S,
         )
 

@@ -54,8 +54,8 @@ def findings_of_truck(vehicle: Vehicle) -> Iterator[CheckFinding]:
         "axle_loads",
         f"{name}: axles carry {front / 1e3:.2f} and {rear / 1e3:.2f} t "
         f"and differ by {100.0 * share:.0f} % of the total",
-        f"load one axle more: below {100.0 * ALIKE_LOADS:.0f} % both deflect the bridge nearly "
-        "alike, and the profile can hardly be separated from the deflection",
+        f"load one axle more than the other: below {100.0 * ALIKE_LOADS:.0f} % both axles deflect "
+        "the bridge nearly alike, which hides the deflection behind the profile",
         is_wrong=share < ALIKE_LOADS,
     )
     low, high = _AXLE_LOADS_KG
@@ -64,17 +64,18 @@ def findings_of_truck(vehicle: Vehicle) -> Iterator[CheckFinding]:
         "total_mass",
         f"{name}: total mass {vehicle.total_mass_kg / 1e3:.2f} t, known to "
         f"{100.0 * vehicle.spread('total_mass_kg'):.1f} %",
-        f"total_mass_kg or front_axle_to_cg_m cannot be right, an axle carries {low / 1e3:g} to "
+        f"total_mass_kg or front_axle_to_cg_m cannot be right: an axle carries {low / 1e3:g} to "
         f"{high / 1e3:g} t"
         if is_mass_odd
-        else "weigh it: every EI is proportional to it, and no residual shows its error",
+        else "weigh the truck: every EI is proportional to its mass, and no residual shows an "
+        "error of it",
         is_wrong=is_mass_odd or vehicle.spread("total_mass_kg") > _LARGEST_MASS_SPREAD,
     )
     shortest, longest = _WHEELBASE_M
     yield check_finding(
         "wheelbase_declared",
         f"{name}: wheelbase {vehicle.wheelbase_m:g} m",
-        f"measure it: trucks have {shortest:g} to {longest:g} m",
+        f"measure it: trucks have a wheelbase of {shortest:g} to {longest:g} m",
         is_wrong=not shortest <= vehicle.wheelbase_m <= longest,
     )
     is_known = vehicle.twin_tyre_distance_m is not None
@@ -84,7 +85,7 @@ def findings_of_truck(vehicle: Vehicle) -> Iterator[CheckFinding]:
         f"{name}: {tyres_in_words(vehicle)}",
         ""
         if is_known
-        else "declare twin_tyre_distance_m (0 for single tyres) and tyre_width_m. They determine "
+        else "declare twin_tyre_distance_m (0 for single tyres) and tyre_width_m, which determine "
         "how well a single element can be resolved",
     )
 
@@ -92,8 +93,8 @@ def findings_of_truck(vehicle: Vehicle) -> Iterator[CheckFinding]:
     yield CheckFinding(
         "cg_height",
         CheckStatus.OK if is_measured else CheckStatus.OPEN,
-        f"{name}: centre of gravity "
-        + (f"{vehicle.cg_height_m:g} m above the road" if is_measured else "of unknown height"),
+        f"{name}: height of the centre of gravity "
+        + (f"{vehicle.cg_height_m:g} m above the road" if is_measured else "unknown"),
         "" if is_measured else "give cg_height_m, or do not brake or accelerate on the bridge",
     )
 
@@ -102,7 +103,7 @@ def tyres_in_words(vehicle: Vehicle) -> str:
     """Return the tyres of the site file in words, with the assumed ones."""
     distance = vehicle.twin_tyre_distance_m
     if distance is None:
-        return "tyres are not declared and twin rear tyres assumed"
+        return "tyres are not declared, so twin rear tyres are assumed"
     kinds = ["twin" if apart > 0.0 else "single" for apart in distance]
     return f"{kinds[0]} front tyres, {kinds[1]} rear tyres"
 
@@ -112,8 +113,8 @@ def sampling(rates_hz: tuple[float, ...]) -> CheckFinding:
     slowest = min(rates_hz)
     return check_finding(
         "sampling_rate",
-        f"slowest sensor {slowest:g} Hz",
-        f"sample at {SLOWEST_RATE_HZ:g} Hz or more, better 500",
+        f"lowest sampling rate {slowest:g} Hz",
+        f"sample at {SLOWEST_RATE_HZ:g} Hz or more, better at 500 Hz",
         is_wrong=slowest < SLOWEST_RATE_HZ,
     )
 
@@ -131,9 +132,9 @@ def noise_declared(site: Site, vehicle: Vehicle) -> CheckFinding:
     silent = [name for name, density in declared.items() if density == 0.0]
     return check_finding(
         "noise_declared",
-        f"noise declared {' '.join(f'{density:g}' for density in densities)} µg/√Hz"
+        f"declared noise {', '.join(f'{density:g}' for density in densities)} µg/√Hz"
         + (f", none for {', '.join(silent)}" if silent else ""),
-        "declare noise_density_ug_per_rthz of the data sheet: the fit is judged by it",
+        "declare noise_density_ug_per_rthz from the data sheet: residuals are compared with it",
         is_wrong=bool(silent),
     )
 
@@ -147,7 +148,7 @@ def findings_of_bridge(bridge: Bridge) -> Iterator[CheckFinding]:
         yield check_finding(
             "survey_speed",
             f"{bridge.id}: to be crossed at {speed:g} m/s",
-            f"below {SLOWEST_M_PER_S:g} m/s a crossing is rejected, drive at 5 m/s or more",
+            f"drive at 5 m/s or more: below {SLOWEST_M_PER_S:g} m/s a crossing is rejected",
             is_wrong=speed < SLOWEST_M_PER_S,
         )
 
@@ -157,8 +158,8 @@ def _ends(bridge: Bridge) -> CheckFinding:
     apart, span = bridge.ends_distance_m, bridge.span_m
     return check_finding(
         "bearings_distance",
-        f"{bridge.id}: ends {apart:.2f} m apart by their coordinates, span_m {span:g}",
-        "take the coordinates where the bearings are, and measure the span with a tape",
+        f"{bridge.id}: ends are {apart:.2f} m apart by their coordinates, span_m is {span:g}",
+        "take the coordinates at the bearings, and measure the span with a tape",
         is_wrong=abs(apart - span) > max(1.0, 0.02 * span),
     )
 
@@ -167,12 +168,12 @@ def _lane(bridge: Bridge) -> Iterator[CheckFinding]:
     """Yield the lane and the torsion of the deck, a line each, where the site file has them."""
     if bridge.lane_offset_m is not None:
         side = "left" if bridge.lane_offset_m >= 0.0 else "right"
-        effect = "the deck twists" if bridge.is_lane_off_axis else "not known to be off it"
+        effect = "so the deck twists" if bridge.is_lane_off_axis else "which may be zero"
         yield CheckFinding(
             "lane",
             CheckStatus.OK,
             f"{bridge.id}: lane {abs(bridge.lane_offset_m):g} ± {bridge.lane_offset_m_spread:g} m "
-            f"{side} of the axis: {effect}",
+            f"{side} of the axis, {effect}",
         )
     declared = [
         f"{what} {value:g}{unit}"

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from services.cli.parser import Subcommand
+from services.common.naming import count_of
 from services.common.options import flag, opt, output_option, positional, site_option
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def _check(options: CheckOptions) -> int:
     print(
         f"{wrong} wrong, {left_open} open"
         if wrong or left_open
-        else "nothing is wrong or open: driveby survey forecasts what a survey would detect"
+        else "nothing is wrong or open; driveby survey forecasts what a survey would detect"
     )
     return int(is_wrong)
 
@@ -127,10 +128,10 @@ def lines_of(report: "CheckReport", *, is_brief: bool) -> Iterator[str]:
         if is_brief and finding.state.value == "ok":
             fine += 1
             continue
-        advice = f": {finding.advice}" if finding.advice else ""
+        advice = f"; {finding.advice}" if finding.advice else ""
         yield f"  {finding.state.value:5}  {finding.text}{advice}"
     if fine:
-        yield f"  ok     {fine} others (--json has all)"
+        yield f"  ok     {count_of(fine, 'other finding')} (--json has all)"
 
 
 def as_json(report: "CheckReport") -> dict[str, Any]:

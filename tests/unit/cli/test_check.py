@@ -19,7 +19,7 @@ def test_the_sample_is_in_order(project: Path, capsys: pytest.CaptureFixture[str
     assert lines[0].endswith("crossing.mcap: site.toml")
     assert [line for line in lines if line.startswith("  wrong")] == []
     assert "unsprung_rear: noise 25" in out
-    assert "bridge-1, start to end: 27 m recorded before it" in out
+    assert "bridge-1, start to end: 27 m of road recorded before the bridge" in out
     assert lines[-1] == "0 wrong, 2 open"
 
 
@@ -49,7 +49,7 @@ def test_recording_with_another_site_reports_what_differs(
     second = capsys.readouterr().out.partition("b.mcap: site.toml\n")[2]
     of_site = second.partition("b.mcap, run")[0].splitlines()
     (line,) = (one for one in of_site if one.startswith("  "))
-    assert line == "  ok     truck-1: centre of gravity 1.1 m above the road"
+    assert line == "  ok     truck-1: height of the centre of gravity 1.1 m above the road"
 
 
 def test_another_site_file_and_json(
@@ -87,7 +87,7 @@ def test_many_runs_are_printed_briefly(shared: Path, capsys: pytest.CaptureFixtu
     folder = shared / "crossings" / "d3_edge_damage_4_runs"
     assert cli.main(["check", str(folder)]) == 0
     out = capsys.readouterr().out
-    assert out.count("others (--json has all)") == 4
+    assert out.count("other findings (--json has all)") == 4
 
 
 @pytest.mark.parametrize(
@@ -141,5 +141,5 @@ def test_the_last_line_says_that_nothing_is_wrong(
     site.write_text(text.replace("[vehicle]\n", f"[vehicle]\n{known}", 1))
     assert cli.main(["check", str(site)]) == 0
     assert capsys.readouterr().out.endswith(
-        "\nnothing is wrong or open: driveby survey forecasts what a survey would detect\n"
+        "\nnothing is wrong or open; driveby survey forecasts what a survey would detect\n"
     )

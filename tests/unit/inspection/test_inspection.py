@@ -144,7 +144,7 @@ def test_receiver_that_is_not_as_declared(tmp_path: Path) -> None:
     assert "position_gaps" in seen(GnssTrack(*columns))  # type: ignore[arg-type]
     jump = np.where(np.arange(count) >= 50, 2e-4, 0.0)
     found = seen(track._replace(latitude_deg=track.latitude_deg + jump))
-    assert "1 jumps" in found["position_jumps"][0].text
+    assert "1 jump" in found["position_jumps"][0].text
     loud = track.speed_m_per_s + 0.5 * rng.standard_normal(count)
     assert "speed_noise" in seen(track._replace(speed_m_per_s=loud))
     scattered = track.longitude_deg + 1.5 / 90e3 * rng.standard_normal(count)
@@ -212,7 +212,10 @@ def test_a_recording_that_begins_too_late(tmp_path: Path) -> None:
         channels={name: values[late] for name, values in run.channels.items()},
     )
     found = findings(tmp_path, cut, case.site)
-    assert "7 m recorded before it, of 39 m wanted" in found["approach_before"][0].text
+    assert (
+        "7 m of road recorded before the bridge, up to 39 m can be used"
+        in found["approach_before"][0].text
+    )
 
 
 def standstill(noise_ug: float, rate_hz: float = 500.0) -> Run:
@@ -251,7 +254,7 @@ def test_few_fixes_are_named_with_the_number_needed(tmp_path: Path) -> None:
     sensor = sound().site.sensor.model_copy(update={"rate_hz": (500.0,) * 4})
     site = sound().site.model_copy(update={"sensor": sensor})
     (found,) = findings(tmp_path, run._replace(gnss=few), site)["positions"]
-    assert found.text == "9 fixes, at least 20 are needed here"
+    assert found.text == "9 fixes, at least 20 are needed"
     assert found.advice.startswith("record longer, or check")
 
 
@@ -361,10 +364,10 @@ def test_lane_and_torsion_are_a_line_each_where_declared() -> None:
 
     assert lines() == []
     assert lines(lane_offset_m=-1.5, torsional_frequency_ratio=2.0, deck_gyration_m=2.3) == [
-        "lane 1.5 ± 0.3 m right of the axis: the deck twists",
+        "lane 1.5 ± 0.3 m right of the axis, so the deck twists",
         "torsion with frequency ratio 2, radius of gyration 2.3 m",
     ]
-    assert lines(lane_offset_m=0.2) == ["lane 0.2 ± 0.3 m left of the axis: not known to be off it"]
+    assert lines(lane_offset_m=0.2) == ["lane 0.2 ± 0.3 m left of the axis, which may be zero"]
 
 
 def test_every_name_is_snake_case_and_says_one_thing() -> None:

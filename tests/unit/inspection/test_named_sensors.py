@@ -90,7 +90,7 @@ def test_missing_unknown_and_disagreeing_channels_are_named(tmp_path: Path) -> N
     (missing,) = found["channels_present"]
     assert missing.text == "7 of 8 accelerometers recorded, unsprung_rear_left missing"
     (unknown,) = found["channels_unknown"]
-    assert unknown.text == "cabin recorded, not in the site file"
+    assert unknown.text == "cabin recorded, but not in the site file"
     loud = run.channels | {"sprung_front_left": 1.3 * run.channels["sprung_front_left"]}
     (gain,) = findings(tmp_path, run._replace(channels=loud), site)["sensors_disagree"]
     assert "sprung_front_left (gain +2" in gain.text

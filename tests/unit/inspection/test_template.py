@@ -81,7 +81,7 @@ def test_usual_truck_leaves_only_what_has_to_be_measured(tmp_path: Path, tyres: 
     assert (tables["twin_tyre_distance_m"][1] > 0.0) == (tyres == "twin")
     front, behind = tables["tyre_stiffness_n_per_m"]
     assert (front == behind) == (tyres == "single")  # two tyres a side have twice the stiffness
-    assert vehicle.count("spreads of 0.1 narrow intervals") == 1
+    assert vehicle.count("a spread of 0.1 narrows the intervals") == 1
 
 
 def test_usual_truck_without_a_template_is_refused() -> None:
