@@ -80,7 +80,7 @@ def read_folder(
         if after.accel_time_s[0] <= before.accel_time_s[-1]:
             raise InputError(
                 f"{after.source}: begins at {after.accel_time_s[0]:.3f} s, before "
-                f"{before.source} ends, runs of one truck must follow one another"
+                f"{before.source} ends; runs of one truck must follow one another"
             )
     return runs
 

@@ -96,7 +96,7 @@ def _how_to_read(asked: ImportOptions, reading: Steps) -> HowToRead:
 
 def _import_ros2(source: Path, drive: _Drive, output: Path, *, force: bool) -> str:
     if output.resolve() in (source.resolve(), *(path.resolve() for path in source.glob("*"))):
-        raise InputError(f"{output}: is what is to be imported, give another file to write")
+        raise InputError(f"{output}: is the file to import; give another file to write")
     truck, messages = messages_of_ros2(
         source, drive.site, drive.site_name, drive.realm, drive.vehicle_id
     )

@@ -45,11 +45,13 @@ def check_plausible(run: Run, site: Site, vehicle: Vehicle | None = None) -> Non
         if found is None and judged.is_beyond(run.channels, ratio):
             raise judged.refuse_unit(run.source, ratio)
         if run.accel_time_s[0] > LATEST_UNIX_S:
-            raise InputError(f"{run.source}: time_s is after 2066: seconds since 1904?")
+            raise InputError(f"{run.source}: time_s is after 2066; is it in seconds since 1904?")
         if any(judged.sentinels(values).any() for values in run.channels.values()):
-            raise InputError(f"{run.source}: 9999 or the like stands for no value")
+            raise InputError(
+                f"{run.source}: 9999 or the like stands for missing values; leave such rows out"
+            )
         if found is not None and found.unit != "m/s2":
-            raise InputError(f"{run.source}: accelerations are in {found.unit}: {found.why}")
+            raise InputError(f"{run.source}: accelerations are in {found.unit}; {found.why}")
 
 
 def _check_gravity(run: Run, site: Site, vehicle: Vehicle) -> None:
@@ -64,8 +66,8 @@ def _check_gravity(run: Run, site: Site, vehicle: Vehicle) -> None:
         if found[name] != declared[name]:
             mean = float(run.channels[name].mean())
             raise InputError(
-                f"{run.source}: the mean of {name} is {mean:.2f} m/s², which contradicts [sensor]: "
-                "gravity_included and up must be as the sensors are"
+                f"{run.source}: the mean of {name} is {mean:.2f} m/s², which contradicts [sensor]; "
+                "gravity_included and up must describe the sensors"
             )
 
 
@@ -84,10 +86,10 @@ def _check_coordinates(run: Run, site: Site) -> None:
         problem = f"its positions are in {read.unit}, not in degrees"
     else:
         name = "longitude_deg" if read.signs[1] < 0.0 else "latitude_deg"
-        problem = f"{name} of its positions has its sign turned"
+        problem = f"{name} of its positions has the wrong sign"
     raise InputError(
-        f"{run.source}: {problem}: {near / 1000:.0f} km from the site's bridges, "
-        f"{read.distance_m / 1000:.1f} km the other way"
+        f"{run.source}: {problem}; they are {near / 1000:.0f} km from the site's bridges as read, "
+        f"{read.distance_m / 1000:.1f} km if corrected"
     )
 
 
@@ -129,7 +131,7 @@ def _strange(run: Run, site: Site) -> Iterator[str]:
         if body is not None and axle is not None and np.std(body) > 2.0 * np.std(axle) > 0.0:
             yield f"the {end} body shakes more than its axle: are the two columns swapped?"
     if np.nanmax(np.abs(run.gnss.altitude_m), initial=0.0) > _HIGHEST_M:
-        yield f"altitudes reach {np.nanmax(run.gnss.altitude_m):g} m: in another unit?"
+        yield f"altitudes reach {np.nanmax(run.gnss.altitude_m):g} m; are they in another unit?"
     note = clock_note(run.accel_time_s, run.gnss.time_s)
     if note is not None:
         yield note

@@ -3,15 +3,17 @@
 from collections import Counter
 from typing import Final, NamedTuple
 
+from services.common.naming import count_of
+
 UNREADABLE: Final = "messages left out"
-TOO_LARGE: Final = "messages larger than any of a sensor, left out"
+TOO_LARGE: Final = "messages too large for a sensor, left out"
 UNKNOWN_TYPE: Final = "messages of another type, left out"
-FAR_STAMPS: Final = "stamps too far from when they were sent"
+FAR_STAMPS: Final = "stamps too far from the time of sending"
 OTHER_FRAME: Final = "messages of another frame, left out"
 SECOND_SENSOR: Final = "messages of a second sensor, left out"
 WRONG_RATE: Final = "messages at a wrong rate, left out"
 UNPUBLISHED: Final = "messages that cannot be published, left out"
-DROPPED: Final = "messages dropped, as too many waited"
+DROPPED: Final = "messages dropped from a full queue"
 _REFUSED: Final = (
     *(UNREADABLE, TOO_LARGE, UNKNOWN_TYPE, FAR_STAMPS, OTHER_FRAME, SECOND_SENSOR, WRONG_RATE),
     UNPUBLISHED,
@@ -79,4 +81,7 @@ class AnomalyCounts:
 
     def _line(self, topic: str, kind: str, number: int) -> str:
         example = self._examples.get((topic, kind), "")
-        return f"{topic}: {number} {kind}{example and f' ({example})'}"
+        things, _, rest = kind.partition(" ")
+        one = things.removesuffix("es") if things == "fixes" else things.removesuffix("s")
+        counted = f"{count_of(number, one, things)} {rest}".rstrip()
+        return f"{topic}: {counted}{example and f' ({example})'}"

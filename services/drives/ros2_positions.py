@@ -55,7 +55,7 @@ class SpeedEstimator:
             self._behind += 1
             if self._behind <= _BACK:
                 return []
-            self._anomalies.add(self._topic, "times that the clock went back")
+            self._anomalies.add(self._topic, "steps back of the clock")
             found = self.finish()
         else:
             found = []

@@ -92,7 +92,9 @@ def read_ros2(source: Path, truck: Ros2Truck) -> Iterator[RosMessage]:
             connection, recorded_ns, payload = found
             # SQLite accepts anything in any column.
             if not isinstance(payload, bytes) or not isinstance(recorded_ns, int):
-                raise _unreadable(source, TypeError(f"{connection.topic} has no message in a row"))
+                raise _unreadable(
+                    source, TypeError(f"{connection.topic} has a row without a message")
+                )
             yield RosMessage(connection.topic, types[connection.id], payload, recorded_ns)
     finally:
         reader.close()
@@ -105,7 +107,7 @@ def _check_file(path: Path) -> None:
         return
     if any(character in str(path) for character in _MEANS_SOMETHING):
         raise InputError(
-            f"{path}: cannot be opened, as there is a ?, # or % in its path; give it another one"
+            f"{path}: cannot be opened, as its path contains ?, # or %; move it to another path"
         )
     log = path.with_name(f"{path.name}-wal")
     if log.is_file() and log.stat().st_size:
@@ -218,7 +220,7 @@ def _encoded(
             yield Message(key, payload, boot_id, sequence, time_ns, time_ns)
     for stream, what in (("accel", "accelerations"), ("gnss", "positions")):
         if not numbers[stream]:
-            why = "; ".join(truck.anomalies.news()[:3]) or "no message of theirs is in it"
+            why = "; ".join(truck.anomalies.news()[:3]) or "it has no message of these topics"
             raise InputError(f"{source}: gives no {what}: {why}")
 
 

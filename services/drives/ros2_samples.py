@@ -83,7 +83,7 @@ class Resampler:
             self._anomalies.add(self._topic, "stamps repeated or in the past, left out")
             self._behind += 1
             if self._behind > self._declared_hz * _LONG_GAP_S:
-                self._anomalies.add(self._topic, "times that the clock went back")
+                self._anomalies.add(self._topic, "steps back of the clock")
                 self._early, self._behind = [(stamp_ns, value)], 0
             return []
         self._behind = 0
@@ -145,7 +145,7 @@ class Resampler:
             self._behind += 1
             if self._behind <= self._rate_hz * _LONG_GAP_S:
                 return []
-            self._anomalies.add(self._topic, "times that the clock went back")
+            self._anomalies.add(self._topic, "steps back of the clock")
             found = self._flush()
             self._anchor(stamp_ns)
             ahead = 0.0

@@ -181,7 +181,7 @@ class Ros2Truck:
         left: list[Accel | GnssFix] = []
         before = self._sources.get(topic)
         if before is not None and source[:2] != before[:2]:
-            self.anomalies.add(topic, "times that another sensor went on")
+            self.anomalies.add(topic, "changes to another sensor")
             if topic in self._samples:
                 left = self._batches(topic, self._at_right_rate(self._samples[topic].restart))
         self._sources[topic] = source
@@ -205,7 +205,7 @@ class Ros2Truck:
 
     def _accelerations(self, topic: str, message: Imu) -> list[Accel | GnssFix]:
         if message.acceleration_m_per_s2 is None:
-            self.anomalies.add(topic, "messages that say they have no acceleration, left out")
+            self.anomalies.add(topic, "messages declared to be without acceleration, left out")
             return []
         up = _up(self._imus[topic], message.acceleration_m_per_s2)
         add = partial(self._samples[topic].add, message.stamp_ns, up)

@@ -37,7 +37,7 @@ def scaled(
                 heads[name] = head
     for head in dict.fromkeys(heads.values()):
         names = [name for name, one in heads.items() if one == head]
-        found.guess(owner[names[0]], f"by the header in {head}: {', '.join(names)}")
+        found.guess(owner[names[0]], f"in {head} by the header: {', '.join(names)}")
     rest = {name: values for name, values in channels.items() if name not in units}
     if rest:
         site, vehicle = target.site, target.vehicle
@@ -55,7 +55,7 @@ def scaled(
         for name in rest:
             units[name] = unit.unit
         if unit.unit != "m/s2":
-            found.guess(first, f"accelerations are in {unit.unit}: {unit.why}")
+            found.guess(first, f"accelerations are in {unit.unit}; {unit.why}")
     for name, unit_name in units.items():
         if unit_name not in ACCELERATION:
             raise InputError(
@@ -68,7 +68,7 @@ def scaled(
         if np.abs(values).max() > MAX_ACCELERATION_M_PER_S2:
             raise InputError(
                 f"{owner[name].sheet.path}: {name} reaches {np.abs(values).max():.3g} m/s², at "
-                f"most {MAX_ACCELERATION_M_PER_S2:g} expected: give its unit in a map (--map)"
+                f"most {MAX_ACCELERATION_M_PER_S2:g} is expected; give its unit in a map (--map)"
             )
     return scaled_to
 
@@ -98,8 +98,8 @@ def as_declared(
         ):
             raise InputError(
                 f"{part.sheet.path}: {name} of the map is declared to "
-                f"{'have' if declared_as[name].is_included else 'be without'} gravity, its mean is "
-                f"{float(np.mean(channels[name])):.3g} m/s²"
+                f"{'have' if declared_as[name].is_included else 'be without'} gravity, but its "
+                f"mean is {float(np.mean(channels[name])):.3g} m/s²; correct gravity_included or up"
             )
         found.column(part, name, gravity_included=gravity.is_included, up=gravity.up)
     for gravity in dict.fromkeys(seen.values()):
@@ -120,5 +120,5 @@ def as_declared(
 
 def _described(gravity: Gravity) -> str:
     if not gravity.is_included:
-        return "no gravity is in"
-    return "gravity is in" if gravity.up > 0 else "gravity is in, and downward in"
+        return "without gravity:"
+    return "with gravity:" if gravity.up > 0 else "with gravity, and pointing down:"

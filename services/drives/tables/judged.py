@@ -86,7 +86,7 @@ def unit_by_numbers(channels: Mapping[str, Floats], ratio: float | None) -> Unit
     if ratio is None:
         return None
     if _IN_G[0] <= ratio <= _IN_G[1]:
-        return UnitFound("g", f"their noise is {ratio:.3f} of the declared one, and 1/9.8 is g")
+        return UnitFound("g", f"their noise is {ratio:.3f} of the declared one, about 1/9.8")
     if _IN_M_PER_S2[0] <= ratio <= _IN_M_PER_S2[1]:
         return UnitFound("m/s2", f"their noise is {ratio:.2f} of the declared one")
     return None
@@ -126,9 +126,9 @@ def refuse_unit(where: str, ratio: float | None) -> InputError:
         seen = f" (their noise is {ratio:.3g} of the declared one"
         in_mm = 6.0 * _IN_MG[0] <= ratio <= 10.0 * _IN_MG[1]
         is_in_mg = _IN_MG[0] <= ratio <= _IN_MG[1]
-        seen += ": mg or cm/s2?)" if is_in_mg else ": mm/s2?)" if in_mm else ")"
+        seen += ", as in mg or cm/s2)" if is_in_mg else ", as in mm/s2)" if in_mm else ")"
     return InputError(
-        f"{where}: the unit of the accelerations is undetermined{seen}, give it in a map (--map): "
+        f"{where}: the unit of the accelerations is undetermined{seen}; give it in a map (--map), "
         f"unit = one of {', '.join(ACCELERATION)}"
     )
 

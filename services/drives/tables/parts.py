@@ -8,6 +8,7 @@ import numpy as np
 
 from services.common.arrays import Floats
 from services.common.errors import InputError
+from services.common.naming import count_of
 from services.drives.tables.angles import SIDES, angles, sides_of
 from services.drives.tables.columns import DATE, TIME, WEEK, ColumnChoice, placed_columns, words_of
 from services.drives.tables.dates import (
@@ -81,7 +82,9 @@ def read_part(
     if tuple(sheet.dialect) != _PLAIN and not _is_given(sheet.dialect, given):
         guesses.append(Guess(name, described(sheet.dialect), "form"))
     if sheet.left_out:
-        words = f"{sheet.left_out} lines of comments, end text or a cut-off row left out"
+        words = (
+            f"left out: {count_of(sheet.left_out, 'line')} of comments, end text or a cut-off row"
+        )
         guesses.append(Guess(name, words, "lost"))
     _check_headers(sheet, placed, given)
     unused = [head for head in unused if head]
@@ -100,7 +103,7 @@ def read_part(
             if one.why == why and quantity not in (TIME, DATE, WEEK)
         ]
         if read:
-            guesses.append(Guess(name, f"by {how} {', '.join(read)}", "columns"))
+            guesses.append(Guess(name, f"by {how}: {', '.join(read)}", "columns"))
     quantities = [q for q in placed if q not in (TIME, DATE, WEEK)]
     holds_samples = any(q not in POSITION_COLUMNS for q in quantities)
     times = _times(sheet, given.time, placed, declared_hz if holds_samples else 0.0, zone, guesses)

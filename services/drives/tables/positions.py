@@ -33,18 +33,18 @@ def track(
             first, second, target.site, unit or "deg", has_signs=has_signs
         )._replace(is_swapped=False)
     if read.unit != "deg" and unit is None:
-        found.guess(part, f"coordinates are in {read.unit}: they are then near a bridge")
+        found.guess(part, f"coordinates are in {read.unit}, which places them near a bridge")
     latitude, longitude = judged.degrees(first, read.unit), judged.degrees(second, read.unit)
     if read.is_swapped:
         latitude, longitude = longitude, latitude
-        found.guess(part, "latitude and longitude are swapped: they are then near a bridge")
+        found.guess(part, "latitude and longitude are swapped, which places them near a bridge")
         found.swap(part, "latitude_deg", "longitude_deg")
     latitude, longitude = read.signs[0] * latitude, read.signs[1] * longitude
     for name, sign in zip(("latitude_deg", "longitude_deg"), read.signs, strict=True):
         found.column(part, name, unit=read.unit)
         if sign < 0.0:
             found.column(part, name, factor=-1.0)
-            found.guess(part, f"{name} has its sign turned: it is then near a bridge")
+            found.guess(part, f"{name} has the wrong sign; the other one places it near a bridge")
     _check_range(part, "latitude_deg", latitude, 90.0)
     _check_range(part, "longitude_deg", longitude, 180.0)
     speed = _speed(part, latitude, longitude, fixes, found)

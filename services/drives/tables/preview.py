@@ -30,7 +30,7 @@ def preview_lines(found: Understood, width: int) -> list[str]:
     """Return the lines printed before anything is written, each at most `width` long."""
     lines = [f"{_KINDS[one.kind]}: {one.text}" for one in grouped(found.guesses)]
     if not lines:
-        lines = ["the files are in the form of the contract"]
+        lines = ["the files have driveby's own format (docs/contract.md); nothing is guessed"]
     for run in found.runs:
         lines += ["", *_of_run(run, width)]
     return lines
@@ -43,7 +43,9 @@ def _of_run(run: Run, width: int) -> list[str]:
     for row in range(min(_ROWS, run.accel_time_s.size)):
         values = [f"{v[row]:.4f}" for v in run.channels.values()]
         table.append((_clock(run.accel_time_s[row]), *values))
-    fixes: list[Sequence[object]] = [("time (UTC)", "latitude", "longitude", "altitude", "speed")]
+    fixes: list[Sequence[object]] = [
+        ("time (UTC)", "latitude", "longitude", "altitude m", "speed m/s")
+    ]
     gnss = run.gnss
     fixes += [
         (

@@ -7,6 +7,7 @@ import numpy as np
 
 from services.common.arrays import Floats
 from services.common.errors import InputError
+from services.common.naming import count_of
 from services.drives.tables.findings import Findings, Target
 from services.drives.tables.judged import sentinels
 from services.drives.tables.mapping import POSITION_COLUMNS
@@ -33,11 +34,12 @@ def samples(
         if common.size < 0.9 * max(time_s.size, other_s.size):
             raise InputError(
                 f"{part.sheet.path}: is not sampled at the times of {parts[0].name}: "
-                f"{common.size} of {other_s.size} times are common, one table of all channels "
+                f"{common.size} of {other_s.size} times are common; one table of all channels "
                 "is expected"
             )
         if (lost := max(time_s.size, other_s.size) - common.size) > 0:
-            found.guess(part, f"{lost} samples are not in every file, left out", "lost")
+            missing = count_of(lost, "sample")
+            found.guess(part, f"left out: {missing} that not every file has", "lost")
         time_s = time_s[here]
         channels = {n: v[here] for n, v in channels.items()}
         channels |= {n: v[there] for n, v in others.items()}
@@ -54,14 +56,16 @@ def _samples_of(
     absent = np.column_stack([sentinels(values[:, k]) for k in range(len(names))])
     if absent.any():
         shown = ", ".join(f"{value:g}" for value in np.unique(values[absent])[:3])
-        found.guess(part, f"{shown} stands for no value in {int(absent.sum())} cells", "lost")
+        cells = count_of(int(absent.sum()), "cell")
+        found.guess(part, f"{shown} stands for a missing value in {cells}", "lost")
         values = np.where(absent, np.nan, values)
     whole = np.isfinite(values).all(axis=1) & np.isfinite(part.times.time_s)
     if not whole.any():
         raise InputError(f"{part.sheet.path}: no row has all of {', '.join(names)}")
     if not whole.all():
         first = part.sheet.numbers[int(np.flatnonzero(~whole)[0])]
-        text = f"rows with empty cells left out, a gap: {int((~whole).sum())} (first: line {first})"
+        empty = count_of(int((~whole).sum()), "row")
+        text = f"left out as a gap: {empty} with empty cells (first in line {first})"
         found.guess(part, text, "lost")
     values, time_s = values[whole], part.times.time_s[whole]
     declared = target.declared_hz
@@ -72,7 +76,7 @@ def _samples_of(
     if kept.late:
         found.guess(part, f"rows not later than the row before left out: {kept.late}", "lost")
     if kept.is_even and even is None:
-        found.guess(part, f"stamps are rounded: samples even at {declared:g} Hz")
+        found.guess(part, f"stamps are rounded; the samples are evenly spaced at {declared:g} Hz")
     found.time(part, even=kept.is_even)
     channels = {n: np.ascontiguousarray(values[kept.rows, k]) for k, n in enumerate(names)}
     return kept.time_s + begin_s, channels
@@ -88,7 +92,8 @@ def fixes(part: TablePart, begin_s: float, found: Findings) -> dict[str, Floats]
     if "speed_mps" in names:
         there &= np.isfinite(table[:, 1 + names.index("speed_mps")])
     if not part.channels() and not there.all():
-        found.guess(part, f"{int((~there).sum())} rows without a fix left out", "lost")
+        rows = count_of(int((~there).sum()), "row")
+        found.guess(part, f"left out: {rows} without a fix", "lost")
     table = table[there]
     if not table.size:
         raise InputError(f"{part.sheet.path}: has no fix, at least 2 expected")
@@ -97,7 +102,7 @@ def fixes(part: TablePart, begin_s: float, found: Findings) -> dict[str, Floats]
     if held is None and part.channels():
         held = float(is_held.mean()) > _HELD
         if held:
-            found.guess(part, "a fix is repeated until the next one: its first row counts")
+            found.guess(part, "each fix is repeated until the next one; its first row counts")
     if held:
         table = table[~is_held]
     found.file(part, held_fixes=bool(held))
@@ -108,10 +113,10 @@ def fixes(part: TablePart, begin_s: float, found: Findings) -> dict[str, Floats]
     if kept.is_even:
         found.time(part, even=True)
         if even is None:
-            found.guess(part, f"stamps are rounded: fixes even at {rate_hz:g} Hz")
+            found.guess(part, f"stamps are rounded; the fixes are evenly spaced at {rate_hz:g} Hz")
     if kept.repeated + kept.late:
-        count = kept.repeated + kept.late
-        found.guess(part, f"{count} fixes with a repeated or earlier time left out", "lost")
+        late = count_of(kept.repeated + kept.late, "fix", "fixes")
+        found.guess(part, f"left out: {late} with a repeated or earlier time", "lost")
     table = table[kept.rows]
     if table.shape[0] < 2:
         raise InputError(f"{part.sheet.path}: has 1 fix, at least 2 expected")

@@ -16,7 +16,7 @@ FIRST_NS = 1_700_000_000_000_000_000
 MISSING = "samples missing, left as gaps"
 PAST = "stamps repeated or in the past, left out"
 OFF = "stamps off by over a tenth of the interval"
-BACK = "times that the clock went back"
+BACK = "steps back of the clock"
 
 
 def taken(

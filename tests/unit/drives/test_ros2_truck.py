@@ -110,7 +110,7 @@ def test_messages_of_another_frame_and_without_accelerometer_are_left_out() -> N
     of = truck()
     none = np.array([-1.0, *np.zeros(8)])
     assert accelerations(of, lambda at: ros2.imu(at, 0.0, covariance=none)).size == 0
-    assert of.anomalies.count(FRONT, "messages that say they have no acceleration, left out") == 20
+    assert of.anomalies.count(FRONT, "messages declared to be without acceleration, left out") == 20
 
 
 def test_a_topic_is_one_sensor_s() -> None:
@@ -142,7 +142,7 @@ def test_a_sensor_that_was_started_anew_goes_on() -> None:
     found += of.finish()
     batches = [one.channels["sprung_front"] for one in found if isinstance(one, Accel)]
     assert sum(batch.samples.size for batch in batches) == 7500
-    assert of.anomalies.count(FRONT, "times that another sensor went on") == 2
+    assert of.anomalies.count(FRONT, "changes to another sensor") == 2
 
 
 def drive(
@@ -232,9 +232,9 @@ def test_stamps_must_be_near_the_time_of_sending() -> None:
     payload = ros2.imu(FIRST_NS, 0.0)
     for sent_ns in (FIRST_NS + 1_000_000_001, FIRST_NS - 1_000_000_001, 0):
         assert of.convert(FRONT, IMU, payload, sent_ns) == []
-    assert of.anomalies.count(FRONT, "stamps too far from when they were sent") == 3
+    assert of.anomalies.count(FRONT, "stamps too far from the time of sending") == 3
     of.convert(FRONT, IMU, payload, FIRST_NS + 1_000_000_000)
-    assert of.anomalies.count(FRONT, "stamps too far from when they were sent") == 3
+    assert of.anomalies.count(FRONT, "stamps too far from the time of sending") == 3
 
 
 def fixes(of: Ros2Truck, payloads: list[bytes]) -> list[GnssFix]:

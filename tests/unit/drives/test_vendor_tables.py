@@ -144,7 +144,7 @@ def one_file() -> dict[str, Any]:
 
 
 def one_file_held() -> dict[str, Any]:
-    """All in one table; a fix is repeated until the next one."""
+    """All in one table; each fix is repeated until the next one."""
     found: dict[str, Any] = dict(ACCEL)
     for name in list(GPS)[1:]:
         found[name] = np.repeat(GPS[name], RATE_HZ // 10)
@@ -207,19 +207,19 @@ VARIANTS: dict[str, Variant] = {
     "gap": Variant(
         lambda: pair(rows(ACCEL, slice(0, 1700), slice(1850, None))), left_out=(slice(1700, 1850),)
     ),
-    "in g": Variant(lambda: pair(scaled(1 / G)), "accelerations are in g: their noise"),
-    "in g with gravity": Variant(lambda: pair(scaled(1 / G, 1.0)), "in g: their mean is about 1"),
-    "in mg with gravity": Variant(lambda: pair(scaled(1000 / G, 1000)), "in mg: their mean is"),
-    "in gal with gravity": Variant(lambda: pair(scaled(100, 100 * G)), "in cm/s2: their mean is"),
-    "gravity": Variant(lambda: pair(scaled(1.0, G)), "gravity is in sprung_front, sprung_rear"),
-    "upside down": Variant(lambda: pair(scaled(-1.0, -G)), "gravity is in, and downward in"),
+    "in g": Variant(lambda: pair(scaled(1 / G)), "accelerations are in g; their noise"),
+    "in g with gravity": Variant(lambda: pair(scaled(1 / G, 1.0)), "in g; their mean is about 1"),
+    "in mg with gravity": Variant(lambda: pair(scaled(1000 / G, 1000)), "in mg; their mean is"),
+    "in gal with gravity": Variant(lambda: pair(scaled(100, 100 * G)), "in cm/s2; their mean is"),
+    "gravity": Variant(lambda: pair(scaled(1.0, G)), "with gravity: sprung_front, sprung_rear"),
+    "upside down": Variant(lambda: pair(scaled(-1.0, -G)), "with gravity, and pointing down:"),
     "no gravity though declared": Variant(
         pair,
-        "no gravity is in sprung_front",
+        "without gravity: sprung_front",
         site=("rate_hz = 500", "rate_hz = 500\ngravity_included = true"),
     ),
     "no header": Variant(
-        lambda: pair(header=False), "by the order of the columns sprung_front is column 2"
+        lambda: pair(header=False), "by the order of the columns: sprung_front is column 2"
     ),
     "neither has a header": Variant(
         lambda: {A: table(ACCEL, header=False), P: table(GPS, header=False)},
@@ -235,7 +235,7 @@ VARIANTS: dict[str, Variant] = {
             pair(scaled(1 / G))
             | {A: table(renamed(scaled(1 / G), "t", *(n.format("g") for n in BODY)))}
         ),
-        "by the header in g: sprung_front",
+        "in g by the header: sprung_front",
     ),
     "German names": Variant(
         lambda: {
@@ -351,18 +351,18 @@ VARIANTS: dict[str, Variant] = {
         note="repeated rows left out: 1",
     ),
     "one fix twice": Variant(
-        lambda: pair(gps=rows(GPS, slice(0, 9), slice(8, None))), note="1 fixes with a repeated"
+        lambda: pair(gps=rows(GPS, slice(0, 9), slice(8, None))), note="1 fix with a repeated"
     ),
     "one empty cell": Variant(
         lambda: pair(holes(ACCEL, "sprung_rear", slice(1700, 1701))),
-        note="rows with empty cells left out, a gap: 1 (first: line 1702)",
+        note="1 row with empty cells (first in line 1702)",
         left_out=(slice(1700, 1701),),
     ),
     "other names of files": Variant(lambda: {"run1.csv": table(ACCEL), "gnss1.csv": table(GPS)}),
     "a file for each channel": Variant(channel_files),
     "one file for both": Variant(lambda: {"drive.csv": table(one_file())}),
     "one file, fixes held": Variant(
-        lambda: {"drive.csv": table(one_file_held())}, "a fix is repeated"
+        lambda: {"drive.csv": table(one_file_held())}, "each fix is repeated"
     ),
     "a line of units": Variant(lambda: pair(units=UNITS_LINE), note="units in line 2"),
     "a description before the table": Variant(
@@ -426,7 +426,7 @@ VARIANTS: dict[str, Variant] = {
             ),
             delimiter=";",
         ),
-        note="1 rows without a fix left out",
+        note="1 row without a fix",
     ),
 }
 
@@ -517,14 +517,14 @@ VARIANTS |= {
         lambda: pair(
             renamed(scaled(1000.0), "t", *(name.format("mm/s²") for name in BODY)),
         ),
-        "by the header in mm/s2",
+        "in mm/s2 by the header",
     ),
     "in mm/s² with gravity": Variant(
-        lambda: pair(scaled(1000.0, 1000.0 * G)), "in mm/s2: their mean is"
+        lambda: pair(scaled(1000.0, 1000.0 * G)), "in mm/s2; their mean is"
     ),
     "ft/s² by the header": Variant(
         lambda: pair(renamed(scaled(1 / 0.3048), "t", *(n.format("ft/s2") for n in BODY))),
-        "by the header in ft/s2",
+        "in ft/s2 by the header",
     ),
     "thousands": Variant(
         lambda: pair(
@@ -544,7 +544,7 @@ VARIANTS |= {
             delimiter=";",
             decimal=",",
         ),
-        "by the header in mg",
+        "in mg by the header",
     ),
     "AM and PM": Variant(
         lambda: {
@@ -608,7 +608,8 @@ VARIANTS |= {
         lambda: pair({"Index": np.arange(3500.0)} | ACCEL), note="not used: Index"
     ),
     "fixes in whole seconds": Variant(
-        lambda: pair(gps=with_times(GPS, np.floor(GPS["time_s"]))), "fixes even at 10 Hz"
+        lambda: pair(gps=with_times(GPS, np.floor(GPS["time_s"]))),
+        "the fixes are evenly spaced at 10 Hz",
     ),
     "blocks of one stamp": Variant(
         lambda: pair(with_times(ACCEL, START_S + np.repeat(np.arange(70) / 10, 50))),
@@ -619,7 +620,7 @@ VARIANTS |= {
     "fields of NMEA": Variant(lambda: pair(gps=nmea_fields()), "speed is in knots"),
     "longitude counted to the west": Variant(
         lambda: pair(gps=GPS | {"longitude_deg": -GPS["longitude_deg"]}),
-        "longitude_deg has its sign turned",
+        "longitude_deg has the wrong sign",
     ),
     "radians": Variant(
         lambda: pair(gps=GPS | {n: GPS[n] / TO_DEGREES for n in ("latitude_deg", "longitude_deg")}),
@@ -662,7 +663,7 @@ VARIANTS |= {
             ),
             P: table(GPS),
         },
-        note="rows with empty cells left out, a gap: 1",
+        note="left out as a gap: 1 row with empty cells",
         left_out=(slice(700, 701),),
     ),
     "9999 for no value": Variant(
@@ -670,12 +671,12 @@ VARIANTS |= {
             ACCEL
             | {"sprung_rear": np.where(np.arange(3500) // 3 == 200, -9999.0, ACCEL["sprung_rear"])}
         ),
-        note="-9999 stands for no value in 3 cells",
+        note="-9999 stands for a missing value in 3 cells",
         left_out=(slice(600, 603),),
     ),
     "a last row that was cut off": Variant(
         lambda: {A: table(ACCEL)[:-30], P: table(GPS)},
-        note="a cut-off row left out",
+        note="end text or a cut-off row",
         left_out=(slice(3499, 3500),),
     ),
     "header of another program": Variant(
@@ -823,7 +824,7 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, str | bytes]], str]] = {
         lambda: pair(
             renamed(scaled(1000 / G), "t", "body front", "body rear", "axle front", "axle rear")
         ),
-        "mg or cm/s2?), give it in a map (--map)",
+        "as in mg or cm/s2); give it in a map (--map)",
     ),
     "gravity in one channel only": (
         lambda: pair(scaled(1.0, G, ("sprung_front",))),
@@ -875,7 +876,10 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, str | bytes]], str]] = {
         lambda: pair({n: np.rint(1e4 * v) if n in CHANNELS else v for n, v in ACCEL.items()}),
         "whole numbers, as counts of a converter are: give factor",
     ),
-    "mm/s² without a header": (lambda: pair(scaled(1000.0)), "mm/s2?), give it in a map (--map)"),
+    "mm/s² without a header": (
+        lambda: pair(scaled(1000.0)),
+        "as in mm/s2); give it in a map (--map)",
+    ),
     "several columns of one name": (
         lambda: {
             A: table(ACCEL | {"x": ACCEL["time_s"]}).replace("x\n", "sprung_rear\n", 1),
@@ -1025,7 +1029,7 @@ def test_preview_shows_guesses_rows_and_curves(tmp_path: Path) -> None:
     lines = preview_lines(found, 90)
     assert (
         lines[0]
-        == "guess: accel_00.csv: accelerations are in g: their mean is about 1, which is gravity "
+        == "guess: accel_00.csv: accelerations are in g; their mean is about 1, which is gravity "
         "in g"
     )
     first = ["14:13:20.000000", *(f"{ACCEL[name][0]:.4f}" for name in CHANNELS)]
@@ -1063,7 +1067,7 @@ def test_uncalibrated_columns_are_read_by_a_factor(tmp_path: Path) -> None:
         ),
         (
             lambda: pair(gps=GPS | {"altitude_m": 1000 * GPS["altitude_m"]}),
-            "altitudes reach 400250 m: in another unit?",
+            "altitudes reach 400250 m; are they in another unit?",
         ),
         (
             lambda: pair(gps=with_times(GPS, GPS["time_s"] + 2.0)),
