@@ -25,21 +25,28 @@ class Metric(NamedTuple):
 
 METRICS: Final = (
     Metric("", "driveby_healthy", "gauge", "1: the service is well and its health is recent"),
-    Metric("", "driveby_health_time_seconds", "gauge", "time of the latest health, Unix"),
+    Metric("", "driveby_health_time_seconds", "gauge", "Unix time of the latest health"),
     Metric("received", "driveby_messages_received_total", "counter", "messages received"),
     Metric("accepted", "driveby_messages_accepted_total", "counter", "messages accepted"),
     Metric("refused", "driveby_messages_refused_total", "counter", "malformed messages refused"),
     Metric("duplicates", "driveby_messages_duplicate_total", "counter", "messages received again"),
     Metric("recovered", "driveby_messages_recovered_total", "counter", "messages fetched later"),
     Metric("lost", "driveby_messages_lost_total", "counter", "messages that no truck has any more"),
-    Metric("dropped", "driveby_messages_dropped_total", "counter", "messages without room"),
+    Metric(
+        "dropped",
+        "driveby_messages_dropped_total",
+        "counter",
+        "messages dropped",
+    ),
     Metric("written", "driveby_messages_durable_total", "counter", "messages on disk"),
     Metric("missing", "driveby_messages_missing", "gauge", "messages missing now"),
-    Metric("gone", "driveby_messages_gone", "gauge", "messages of deleted files, not come again"),
+    Metric(
+        "gone", "driveby_messages_gone", "gauge", "messages of deleted files, not received again"
+    ),
     Metric("to_fetch", "driveby_messages_to_fetch", "gauge", "messages to fetch from spools"),
     Metric("rate_per_s", "driveby_messages_per_second", "gauge", "messages received per second"),
     Metric("queue", "driveby_queue_messages", "gauge", "messages received and not processed"),
-    Metric("queue_bytes", "driveby_queue_bytes", "gauge", "memory of these messages"),
+    Metric("queue_bytes", "driveby_queue_bytes", "gauge", "memory of the queue"),
     Metric("lag_s", "driveby_lag_seconds", "gauge", "longest delay since the health before"),
     Metric(
         "durable_lag_s",
@@ -59,14 +66,18 @@ METRICS: Final = (
         "vehicle",
     ),
     Metric(
-        "clock_drift_ppm/", "driveby_truck_clock_drift_ppm", "gauge", "drift of that", "vehicle"
+        "clock_drift_ppm/",
+        "driveby_truck_clock_drift_ppm",
+        "gauge",
+        "drift of the clock offset",
+        "vehicle",
     ),
     Metric("identifying", "driveby_crossings_identifying", "gauge", "crossings being identified"),
     Metric(
         "identifying_longest_s",
         "driveby_crossing_identifying_longest_seconds",
         "gauge",
-        "longest time of one of them so far",
+        "longest current identification",
     ),
     Metric(
         "waiting_for_process",

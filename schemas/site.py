@@ -135,7 +135,8 @@ class Site(Table):
                 )
         elif sensor.up != (1, 1, 1, 1):
             raise error_at(
-                "sensor.up", "is of the four channels, the vehicle's sensors must point up"
+                "sensor.up",
+                "applies to the four usual channels only, [[vehicle.sensors]] must point up",
             )
         for number, vehicle in enumerate(self.vehicles):
             for place, one in enumerate(vehicle.sensors):

@@ -54,7 +54,9 @@ def in_pairs(table: Any) -> Any:
     kept: dict[str, Any] = {}
     if len(known.axles) > 2 or known.bogies:
         if len(known.axles) == 2:
-            raise error_at("bogies", "joins axles of a truck of two, it must be of axles 2 and 3")
+            raise error_at(
+                "bogies", "joins axles of a two-axle truck, it must join axles 2 and 3 of three"
+            )
         axles = _with_tracks(known.axles, table.get("track_m"))
         tandem = tandem_of(axles, known.bogies)
         kept = {"axles": axles, "bogies": known.bogies}
@@ -89,14 +91,14 @@ def _check_places(known: Axles) -> None:
     places = [axle.position_m for axle in known.axles]
     if places[0] != 0.0:
         raise error_at(
-            "axles.0.position_m", f"is {places[0]:g}, it must be 0: the first axle's place"
+            "axles.0.position_m", f"is {places[0]:g}, it must be 0, the position of the first axle"
         )
     for number in range(1, len(places)):
         if places[number] <= places[number - 1]:
             raise error_at(
                 f"axles.{number}.position_m",
                 f"is {places[number]:g}, it must be a length greater than {places[number - 1]:g} m:"
-                " axles are listed in the order in which they pass",
+                " axles are listed from front to rear",
             )
     for number, bogie in enumerate(known.bogies):
         if max(bogie.axles) > len(places):
@@ -167,8 +169,8 @@ def _centre_of_gravity(front: Axle, rear: Axle, table: dict[str, Any]) -> dict[s
         if abs(whole / total - 1.0) > _LARGEST_LOAD_ERROR:
             raise error_at(
                 "axles",
-                f"carry {whole:g} kg by their load_kg but total_mass_kg is {total:g}, both must "
-                "be of the truck as it is driven",
+                f"carry {whole:g} kg by their load_kg, but total_mass_kg is {total:g}; both must "
+                "be those of the truck as driven",
             )
         behind = total * rear.load_kg / whole
         spread_kg = (

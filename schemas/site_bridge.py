@@ -185,7 +185,7 @@ class Bridge(Lane, Damping, WithSpreads):
         if per_element is None and self.flexural_rigidity_nm2 is None:
             raise error_at(
                 "flexural_rigidity_nm2",
-                "is missing, give the sound bridge's flexural rigidity in N·m² "
+                "is missing, give the undamaged bridge's flexural rigidity in N·m² "
                 "(or flexural_rigidity_per_element_nm2)",
             )
         for key, values in (
@@ -312,7 +312,7 @@ def _check_physics(bridge: Bridge) -> None:
     span = max(bridge.lengths_of_spans_m)
     limits = _rigidities(span, mass)
     low_hz, high_hz = (_first_hz(span, mass, rigidity) for rigidity in limits)
-    because = f"{span:g} m of {mass:g} kg/m swing at {low_hz:.2g} to {high_hz:.3g} Hz"
+    because = f"{span:g} m of {mass:g} kg/m vibrate at {low_hz:.2g} to {high_hz:.3g} Hz"
     if mass < _LIGHTEST_DECK_KG_PER_M and span > _SHORTEST_BRIDGE_M:
         because += f"; or is mass_per_length_kg_per_m in t/m? then it is {1e3 * mass:g}"
     single = "flexural_rigidity_nm2"
@@ -326,7 +326,7 @@ def _check_physics(bridge: Bridge) -> None:
     mean = math.exp(math.fsum(map(math.log, nominal)) / len(nominal))
     first_hz = _first_hz(span, mass, mean)
     omega = 2.0 * math.pi * first_hz
-    because = f"beyond it the first mode, {first_hz:.2g} Hz, does not swing"
+    because = f"beyond it the first mode, {first_hz:.2g} Hz, does not vibrate"
     because += _damping_meant(bridge.rayleigh_alpha_per_s, bridge.rayleigh_beta_s, omega)
     for key, value, most, noun, unit in (
         ("rayleigh_alpha_per_s", bridge.rayleigh_alpha_per_s, 2.0 * omega, "a coefficient", "1/s"),

@@ -54,15 +54,15 @@ def _given(table: dict[str, Any]) -> ImpliedQuantity:
     clamped_hz = first_frequency_hz(bridge, is_clamped=True)
     ratio, of_clamped = (given_hz / free_hz) ** 2, (given_hz / clamped_hz) ** 2
     text = (
-        f"{bridge.id}: first_frequency_hz {given_hz:g}, EI, mass and spans give {free_hz:.3g} Hz "
-        f"with bearings free to turn; damping_ratio {table['damping_ratio']:g}"
+        f"{bridge.id}: first_frequency_hz is {given_hz:g}, EI, mass and spans imply {free_hz:.3g} "
+        f"Hz with bearings free to turn; damping_ratio is {table['damping_ratio']:g}"
     )
     per_element = bridge.flexural_rigidity_per_element_nm2 is not None
     key = "flexural_rigidity_" + ("per_element_nm2" if per_element else "nm2")
     rigidity = sum(bridge.nominal_flexural_rigidity_nm2) / bridge.elements
     meant = (
-        f"{key} is {rigidity:.3g}{' in the mean' if per_element else ''}: "
-        f"{rigidity * ratio:.3g} for {given_hz:g} Hz"
+        f"{key} is {rigidity:.3g}{' in the mean' if per_element else ''}; {given_hz:g} Hz needs "
+        f"{rigidity * ratio:.3g}"
     )
     if ratio > 1.0:
         meant += f" with bearings free to turn, {rigidity * of_clamped:.3g} with clamped ends"

@@ -72,7 +72,7 @@ def warnings_of(site: Site, toml_text: str = "") -> list[str]:
     """Return a line for everything that is unusual in a site, and in its text if it is given."""
     found = [one for vehicle in site.vehicles for one in implied_by(site, vehicle)]
     found += given_frequencies(toml_text)
-    return list(dict.fromkeys(f"{one.text}: {one.advice}" for one in found if one.is_unusual))
+    return list(dict.fromkeys(f"{one.text}; {one.advice}" for one in found if one.is_unusual))
 
 
 def of_truck(vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
@@ -138,8 +138,8 @@ def _loads(vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     if abs(reversed_apart) > left * abs(apart):
         return
     text = (
-        f"{vehicle.id}: load on the rear over the front springs {loads:.2g}, springs, tyres and "
-        f"axle masses are made for {made_for:.2g}: made over given {made_for / loads:.2g}"
+        f"{vehicle.id}: rear over front spring load {loads:.2g}, but springs, tyres and axle "
+        f"masses suit {made_for:.2g}, {made_for / loads:.2g} times as much"
     )
     meant = (
         f"front_axle_to_cg_m is {vehicle.front_axle_to_cg_m:g}: measured from the rear axle? then "
@@ -300,9 +300,9 @@ def _elements(bridge: Bridge) -> Iterator[ImpliedQuantity]:
     if bridge.elements > spans:
         return
     probable = sum(max(3, round(length / _ELEMENT_M)) for length in bridge.lengths_of_spans_m)
-    text = f"{bridge.id}: {bridge.elements} elements over {spans} spans: no weak place is located"
+    text = f"{bridge.id}: {bridge.elements} elements over {spans} spans locate no weak element"
     if spans == 1:
-        text = f"{bridge.id}: a single element: no weak place is located"
+        text = f"{bridge.id}: a single element locates no loss along the bridge"
     meant = f"elements is {bridge.elements}: {probable} are typical here"
     value = float(bridge.elements)
     yield ImpliedQuantity("elements", text, value, spans + 1.0, 3.0 * probable, "elements", meant)

@@ -184,7 +184,7 @@ def validation_json(record: ValidationRecord) -> str:
 
 def load_validation(path: Path) -> ValidationRecord:
     """Read a validation record; raise InputError if it is not one or its name is not its hash."""
-    found = load_json(ValidationRecord, path, "a certificate")
+    found = load_json(ValidationRecord, path, "a validation record")
     if found.hash != path.stem:
         raise InputError(f"{path}: hash: is {found.hash}, it must be the name of its file")
     return found

@@ -280,7 +280,11 @@ def test_one_table_in_a_list_is_the_same_site() -> None:
             "5\nflexural_rigidity_per_element_nm2 = [1e10]",
             "bridge.flexural_rigidity_per_element_nm2 has 1 values",
         ),
-        ("flexural_rigidity_nm2", "", "bridge.flexural_rigidity_nm2 is missing, give the sound"),
+        (
+            "flexural_rigidity_nm2",
+            "",
+            "bridge.flexural_rigidity_nm2 is missing, give the undamaged",
+        ),
         ("rayleigh_beta_s", "-0.1", "bridge.rayleigh_beta_s is -0.1, it must be a time of at lea"),
         ("rate_hz", "[1, 2]", "sensor.rate_hz"),
         ("rate_hz", "0", "sensor.rate_hz is 0, it must be a rate of at least 1 Hz"),

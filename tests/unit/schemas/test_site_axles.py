@@ -228,7 +228,7 @@ def test_both_spellings_are_refused_by_both_keys(key: str, value: str, other: st
         ),
         (
             (HEAD, FRONT, REAR.replace("load_kg = 10000", "load_kg = 13000")),
-            "vehicle.axles carry 19000 kg by their load_kg but total_mass_kg is 16000",
+            "vehicle.axles carry 19000 kg by their load_kg, but total_mass_kg is 16000",
         ),
         (
             (HEAD, FRONT, REAR.replace("1100", "10100")),
@@ -252,7 +252,7 @@ def test_both_spellings_are_refused_by_both_keys(key: str, value: str, other: st
         ),
         (
             (HEAD, FRONT, REAR, "[[vehicle.bogies]]\naxles = [1, 2]\n"),
-            "vehicle.bogies joins axles of a truck of two, it must be of axles 2 and 3",
+            "vehicle.bogies joins axles of a two-axle truck, it must join axles 2 and 3 of three",
         ),
         (
             (HEAD, "track_m = 'wide'\n", FRONT, REAR),

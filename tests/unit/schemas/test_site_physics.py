@@ -74,7 +74,7 @@ def test_the_range_says_what_it_follows_from() -> None:
     output = complaint(with_line("flexural_rigidity_nm2", "8.5e6"))
     assert output == (
         "bridge.flexural_rigidity_nm2 is 8.5e+06, it must be a flexural rigidity from 4.086e+07 to "
-        "3.6e+12 N·m²: 20 m of 4000 kg/m swing at 0.4 to 118 Hz; in kN·m²? then it is 8.5e+09"
+        "3.6e+12 N·m²: 20 m of 4000 kg/m vibrate at 0.4 to 118 Hz; in kN·m²? then it is 8.5e+09"
     )
 
 

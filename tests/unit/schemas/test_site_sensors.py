@@ -171,7 +171,7 @@ def test_a_part_seen_from_one_side_is_refused(
         ),
         (
             text_of(of_sensor="rate_hz = 200\nup = [1, 1, 1, -1]\n"),
-            "sensor.up is of the four channels, the vehicle's sensors must point up",
+            "sensor.up applies to the four usual channels only, [[vehicle.sensors]] must point up",
         ),
         (
             TEXT.replace("noise_density_ug_per_rthz", "# "),

@@ -105,7 +105,7 @@ def test_invalid_certificate_gives_one_line(tmp_path: Path) -> None:
     good = json.loads(validation_json(certificate()))
     path = validation_path(tmp_path, good["hash"])
     for content, what in (
-        ("{", "not a certificate"),
+        ("{", "not a validation record"),
         (json.dumps(good | {"passed": None}), "passed"),
         (json.dumps(good | {"more": 1}), "more"),
         (json.dumps(good | {"hash": "0" * 16}), "hash: is 0000000000000000"),
