@@ -58,6 +58,6 @@ class LivenessProbe:
             self._heard_s, self._replies = now_s, None
             if self._missed == _MISSES:
                 raise StaleConnectionError(
-                    "the connection stands, but nothing comes through it: "
-                    f"{', '.join(sorted(self._there))} should be there, and there is no answer"
+                    "the connection is up but delivers nothing: "
+                    f"{', '.join(sorted(self._there))} should answer and do not"
                 ) from None

@@ -297,7 +297,7 @@ def other_realms_hint(realm: str, elsewhere: dict[str, set[str]]) -> str | None:
         for other, trucks in sorted(elsewhere.items())[:3]
     ]
     first = min(elsewhere)
-    return f"nothing in realm {realm}, but {' and '.join(where)}: --realm {first}"
+    return f"nothing in realm {realm}, but {' and '.join(where)}; use --realm {first}"
 
 
 def _history_depth(stream: str, past_s: float) -> int:

@@ -223,7 +223,7 @@ def _access_control(tls: Path) -> dict[str, Any]:
     except zenoh.ZError as error:
         raise InputError(f"{path}: {_first_sentence(error)}") from None
     if not (access["enabled"] and access["default_permission"] == "deny" and access["subjects"]):
-        raise InputError(f"{path}: lets everybody do everything; make it with `driveby certs`")
+        raise InputError(f"{path}: permits everything to everybody; create it with `driveby certs`")
     return dict(access)
 
 

@@ -67,7 +67,7 @@ def crossings_to_fuse(name: str, files: Sequence[Results]) -> CrossingsToFuse:
     crossings = {c.crossing_id: c for one in ordered for c in one.crossings}
     realms = sorted({crossing.realm for crossing in crossings.values()})
     if len(realms) > 1:
-        raise InputError(f"{name}: crossings of {', '.join(realms)}; {ONE_REALM}")
+        raise InputError(f"{name}: has crossings of realms {', '.join(realms)}; {ONE_REALM}")
     repeated = sum(len(one.crossings) for one in ordered) - len(crossings)
     by_time = sorted(crossings.values(), key=lambda crossing: crossing.entry_time)
     _check_entries(name, [one for one in by_time if one.parameters is not None])

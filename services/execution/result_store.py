@@ -151,7 +151,10 @@ def _bridges_of(folder: Path, problem: Callable[[str], object]) -> Results | Non
     try:
         return load_results(folder / BRIDGES)
     except InputError as error:
-        problem(f"{error}; crossings have no shares of their tracks, run identify --into again")
+        problem(
+            f"{error}; crossings lack the shared fractions of their wheel-path groups; run "
+            "identify --into again"
+        )
         return None
 
 

@@ -96,7 +96,7 @@ def _datastreams(bridge: Bridge) -> Iterator[Entity]:
             yield {
                 "@iot.id": f"{_element(bridge, number)}.{kind}",
                 "name": f"EI of element {number}, {how}",
-                "description": "mean of the posterior; std and 95 % interval stand in parameters",
+                "description": "mean of the posterior; std and 95 % interval are in parameters",
                 "observationType": _MEASUREMENT,
                 "unitOfMeasurement": _UNIT,
                 "Thing": {"@iot.id": bridge.id},

@@ -165,7 +165,7 @@ def _comparison_sentence(found: PeriodComparison, unit: Unit, language: Language
         for one in clear[:_MAX_ELEMENTS]
     )
     more = len(clear) - _MAX_ELEMENTS
-    others = language.text("change.more", number=more) if more > 0 else ""
+    others = language.choice("change.more", more) if more > 0 else ""
     return language.text("change.clear", **times, changed=changed + others)
 
 

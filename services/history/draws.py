@@ -40,7 +40,7 @@ def check_draws(path: Path, method: str) -> None:
     """Refuse an invalid file or method before the work is done."""
     check_draws_file(path)
     if not METHODS[method].has_noise_model:
-        raise InputError(f"--draws: method {method} has no draws, pre has")
+        raise InputError(f"--draws: method {method} has no draws, use --method pre")
 
 
 def check_draws_file(path: Path) -> None:

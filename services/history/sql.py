@@ -74,7 +74,7 @@ def _run_query(question: str, files: str | list[str], problems: tuple[str, ...])
         try:
             asked = connection.extract_statements(question)
             if [one.type for one in asked] != [duckdb.StatementType.SELECT]:
-                raise InputError("--sql: one question that begins with SELECT … is expected")
+                raise InputError("--sql: one query that begins with SELECT … is expected")
             _check_editions(connection, files)
             crossings = connection.read_parquet(files, hive_partitioning=True, union_by_name=True)
             crossings.create_view("crossings")

@@ -44,7 +44,9 @@ def _rows(path: Path) -> dict[str, list[tuple[float, float]]]:
         try:
             time_s, value = float(row["time_s"]), float(row["temperature_deg_c"])
         except (TypeError, ValueError):
-            raise InputError(f"{path}: line {number}: two numbers are expected") from None
+            raise InputError(
+                f"{path}: line {number}: time_s and temperature_deg_c must be numbers"
+            ) from None
         if not (isfinite(time_s) and _LOWEST <= value <= _HIGHEST):
             raise InputError(
                 f"{path}: line {number}: {value:g} is not a temperature of a bridge in °C "

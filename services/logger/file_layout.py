@@ -63,12 +63,12 @@ def file_slot(name: FileName, open_: Mapping[FileName, float], now_s: float) -> 
     limit = MAX_SERVICE_FILES if is_service else MAX_FILES_OF_ONE
     closable = [one for one in open_ if one[1] == name[1]]
     owner = "of services" if is_service else "of this vehicle"
-    why = f"had no file: {limit} {owner} are open, in as many realms"
+    why = f"had no file: {limit} files {owner} are open, one for each realm"
     if len(closable) < limit:
         if len(open_) < MAX_OPEN_FILES:
             return FileSlot()
         closable = list(open_)
-        why = f"had no file: {MAX_OPEN_FILES} of all vehicles are open"
+        why = f"had no file: {MAX_OPEN_FILES} files of all vehicles are open"
     quietest = min(closable, key=lambda one: open_[one])
     if now_s - open_[quietest] < _SHORTEST_QUIET_S:
         return FileSlot(why_not=why)

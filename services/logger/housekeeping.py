@@ -20,6 +20,7 @@ from schemas.topics import REALM, single_realm
 from services.common.child_process import run_gently
 from services.common.disk import DISK, Disk
 from services.common.errors import FailureError, InputError
+from services.common.naming import count_of
 from services.recordings.recording import is_being_written, is_closed
 from services.recordings.recovery import ASIDE, put_aside, recovered_path
 
@@ -125,8 +126,8 @@ class Housekeeping:
                 self._report(path, EventKind.RECORDING_DELETED, text)
         if total > budget_bytes and not self._is_over_budget:
             text = (
-                f"recordings take {total / 1e6:.0f} MB of {budget_bytes / 1e6:.0f} MB, and none "
-                "of them may be deleted: crossings in them are not identified"
+                f"recordings take {total / 1e6:.0f} MB of the budget of {budget_bytes / 1e6:.0f} "
+                "MB, and none can be deleted, as each has crossings that are not identified"
             )
             self._report(None, EventKind.DISK_LOW, text)
         self._is_over_budget = total > budget_bytes
@@ -167,13 +168,12 @@ def _recordings(house: RetentionPolicy, *endings: str) -> Iterator[Path]:
 def recovery_text(path: Path, found: dict[str, Any]) -> str:
     """Return the result of a recovery, the JSON of `driveby recover`, in words."""
     text = (
-        f"{path.name} was cut off; {found['messages']} messages recovered to "
+        f"{path.name} was cut off; {count_of(found['messages'], 'message')} recovered to "
         f"{recovered_path(path).name}, {found['damaged_bytes']} bytes damaged"
     )
     if found["lost"] is not None:
         return f"{text}, {found['lost']} lost"
     return (
-        f"{text}; the end of the file is missing, with an unknown number of messages: by the "
-        "numbers of the trucks' messages, those that cannot be fetched again count as missing or "
-        "lost"
+        f"{text}; the end of the file is missing, with an unknown number of messages; those that "
+        "cannot be fetched from the trucks again count as missing or lost"
     )

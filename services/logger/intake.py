@@ -18,6 +18,7 @@ from schemas.signals import Identity
 from schemas.topics import Key, Message, Topic, topic
 from services.bus.subscription import RawSample, SeenSequences
 from services.common.intervals import Intervals
+from services.common.naming import count_of
 from services.logger.clock_watch import ClockWatch
 from services.logger.known_streams import StreamCache, StreamRecord
 
@@ -155,12 +156,12 @@ class Intake:
         events = self._clocks.steps(self.realm or "live", now_ns, now_s)
         events += self._refusals(now_ns, now_s, closing=closing)
         for (where, boot_id), number in self._late.items():
-            text = "came late and stand later in the file"
+            text = "received late and written later in the file"
             events.append(_event(where, boot_id, EventKind.RECOVERED, now_ns, text, number))
         self._late.clear()
         for (where, boot_id), numbers in self._lost.items():
             for first, last in numbers.ranges():
-                text = "are lost, the truck no longer has them"
+                text = "lost; no longer in the truck's spool"
                 events.append(
                     _event(where, boot_id, EventKind.LOST, now_ns, text, last - first + 1, first)
                 )
@@ -191,11 +192,13 @@ class Intake:
         highest = numbers.highest
         sequence = identity.sequence
         if numbers.runs >= MAX_RUNS and not _touches(numbers, sequence):
-            raise ValueError(f"{where.stream}: more than {MAX_RUNS} holes in the sequence")
+            raise ValueError(f"{where.stream}: more than {MAX_RUNS} gaps in the sequence")
         crc = zlib.crc32(payload)
         if not numbers.add(sequence):
             if stream.recent.get(identity, crc) != crc:
-                raise ValueError(f"{where.stream}: sequence {sequence} again, with another content")
+                raise ValueError(
+                    f"{where.stream}: sequence {sequence} received again with other content"
+                )
             return False
         stream.recent[identity] = crc
         if len(stream.recent) > _RECENT:
@@ -319,7 +322,7 @@ def _event(
     event = Event(
         kind,
         now_ns,
-        f"{number} messages of {where.owner}/{where.identifier}/{where.stream} {text}",
+        f"{count_of(number, 'message')} of {where.owner}/{where.identifier}/{where.stream} {text}",
         vehicle=vehicle,
         stream=where.stream,
         boot_id=boot_id,

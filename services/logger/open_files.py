@@ -16,6 +16,7 @@ from schemas.events import Event, EventKind
 from schemas.topics import Key, Message, topic
 from services.common.disk import Disk
 from services.common.intervals import Intervals
+from services.common.naming import count_of
 from services.logger.cataloguing import Cataloguing
 from services.logger.drops import FAILED, Drops
 from services.logger.durable import DurableStreams
@@ -273,7 +274,7 @@ class OpenFiles:
         text = f"{file.path.name} was {what} by another process while it was being written"
         number = 0
         if what == "moved":
-            text += f"; it holds {file.messages} messages"
+            text += f"; it holds {count_of(file.messages, 'message')}"
             with failing(name):
                 file.finish("moved", {})
         else:
@@ -287,7 +288,9 @@ class OpenFiles:
             confirmed = self.durable.withdraw(gone)
             self._unsynced = [(n, m) for n, m in self._unsynced if n != name]
             self.withdrawn.append(gone)
-            text += f": {number} messages are gone, {confirmed} of them were confirmed as durable"
+            text += (
+                f": {count_of(number, 'message')} lost, {confirmed} of them confirmed as durable"
+            )
         with failing(name):
             path = free_path(self._place, *name)
             self._open(name, path, f"the file before it was {what}", file.path.name, latched)

@@ -35,6 +35,7 @@ from services.common.files import check_folder_writable
 from services.common.interrupts import handled_by
 from services.common.intervals import Intervals
 from services.common.log_lines import about
+from services.common.naming import count_of
 from services.logger.completeness import Completeness
 from services.logger.drops import QUEUE_IS_FULL, Drop
 from services.logger.file_layout import RecordingTarget
@@ -303,7 +304,7 @@ class _Announcements:
                 self._drops_reported_s.clear()
             self._drops_reported_s[name] = now_s
             kind = EventKind.QUEUE_FULL if is_queue else EventKind.DROPPED
-            text = f"{drop.messages} messages {drop.why}"
+            text = f"{count_of(drop.messages, 'message')} {drop.why}"
             event = Event(kind, now_ns, text, vehicle=drop.vehicle, messages=drop.messages)
             self.event(drop.realm, event)
 

@@ -97,7 +97,7 @@ def read_messages(
             yield item
         elif isinstance(item, Damage):
             grows = item.is_cut_off and is_being_written(path)
-            warn(f"{path}: {'is being written, read as far as it is' if grows else item.text}")
+            warn(f"{path}: {'is being written; read up to its end now' if grows else item.text}")
     if not found:
         raise InputError(f"{path}: holds no driveby message; a recording of a truck is expected")
 
@@ -319,7 +319,7 @@ def our_channel(
     try:
         where = parse_key(channel.topic)
     except ValueError:
-        warn(f"{path}: topic {channel.topic!r:.80} is not ours and is left out")
+        warn(f"{path}: topic {channel.topic!r:.80} is not one of driveby and is left out")
         return None
     is_number = boot_id.isascii() and boot_id.isdecimal() and len(boot_id) <= _BOOT_DIGITS
     return where, int(boot_id) if is_number else 0

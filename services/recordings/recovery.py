@@ -40,7 +40,7 @@ ASIDE = ".crashed"
 """Suffix of a damaged recording that another one has replaced."""
 SERVICE = "recover"
 """Name of the service that writes the event in a recovered recording."""
-NOT_FINISHED = "recovered, the writer did not get to finish it"
+NOT_FINISHED = "recovered, as its writer did not finish it"
 """Reason in the END of a recovered recording that had none."""
 
 
@@ -140,7 +140,7 @@ def recover_recording(
                 f"{source}: is being written, or recovered by another process, at this moment"
             ) from None
         if not any(not isinstance(item, Damage) for item in _read(source, file)):
-            raise InputError(f"{source}: holds nothing of an MCAP recording that can be read")
+            raise InputError(f"{source}: holds nothing readable of an MCAP recording")
         if target == recovered_path(source):  # the lock of the source covers it
             remove_leftovers(target)
         with contextlib.ExitStack() as renaming:
@@ -358,17 +358,21 @@ class _Copier:
 
 def describe(recovery: Recovery) -> str:
     """Return the result of a recovery in one line."""
-    lost = "an unknown number of" if recovery.lost is None else f"{recovery.lost:,}"
-    parts = [f"{recovery.messages:,} messages recovered"]
+    lost = "an unknown number of messages" if recovery.lost is None else _messages(recovery.lost)
+    parts = [f"{_messages(recovery.messages)} recovered"]
     if recovery.is_lossy:
-        parts.append(f"{lost} messages lost")
+        parts.append(f"{lost} lost")
     if recovery.missing_numbers:
-        parts.append(f"{recovery.missing_numbers:,} numbers missing from the sequences")
+        parts.append(f"{recovery.missing_numbers:,} sequence numbers missing")
     if recovery.damaged_places:
         places = "1 place" if recovery.damaged_places == 1 else f"{recovery.damaged_places} places"
         parts.append(f"{recovery.damaged_bytes:,} of {recovery.bytes:,} bytes damaged in {places}")
     parts += ["the file ends without its summary"] if recovery.is_cut_off else []
     return ", ".join(parts)
+
+
+def _messages(number: int) -> str:
+    return f"{number:,} message{'' if number == 1 else 's'}"
 
 
 def _own_schema(channel: Channel) -> tuple[str, str, bytes] | None:

@@ -81,7 +81,9 @@ def chosen_keys(choice: ReplaySelection, keys: Iterable[Key]) -> dict[Key, str]:
         for pattern in patterns:
             if not any(_fits(pattern, where) for where in all_keys):
                 known = ", ".join(sorted({_name(where) for where in all_keys})[:12])
-                raise InputError(f'{option}: "{pattern}" fits nothing recorded: {known}')
+                raise InputError(
+                    f'{option}: "{pattern}" matches no topic of the recording, which has {known}'
+                )
     renames = _renames(choice.renames, trucks)
     found = {
         where: renames.get(where.identifier, where.identifier)

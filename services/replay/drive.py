@@ -10,6 +10,7 @@ from schemas.site_file import load_site
 from schemas.topics import Key, Message, parse_key, topic
 from services.catalogue.contents import RecordingSummary, summarise_recording
 from services.common.errors import InputError
+from services.common.naming import count_of
 from services.recordings.merge import TimedMessage, read_together, recordings_in
 from services.recordings.recording import check_message, is_being_written
 from services.replay.choice import (
@@ -120,10 +121,10 @@ def warn_of_silence(drive: ReplayDrive) -> None:
     if silences:
         stop, start = max(silences, key=lambda silence: silence[1] - silence[0])
         _log.warning(
-            "nothing was recorded for %.0f s after %s%s; --skip-gaps skips it",
+            "nothing was recorded for %.0f s after %s%s; --skip-gaps skips such gaps",
             (start - stop) * 1e-9,
             utc_text(stop),
-            f", nor {len(silences) - 1} times more" if len(silences) > 1 else "",
+            f", and in {count_of(len(silences) - 1, 'shorter gap')}" if len(silences) > 1 else "",
         )
 
 

@@ -22,6 +22,7 @@ from services.bus.playback import (
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
 from services.common.errors import FailureError, InputError
+from services.common.naming import count_of
 from services.replay.choice import selection_of
 from services.replay.drive import ReplayDrive, open_drive, warn_of_silence
 from services.replay.player import Command, Controls, PlaybackResult, PlaybackSettings, play
@@ -99,7 +100,7 @@ def run(
                 took_s = time.monotonic() - began_s
             confirm(delivery, sum(played[0].by_stream.values()))
             statistics = _statistics(realm, drive, played, took_s, delivery)
-            _log.info("%d messages published in realm %s", statistics.messages, realm)
+            _log.info("%s published in realm %s", count_of(statistics.messages, "message"), realm)
             report(statistics)
         finally:
             delivery.close()

@@ -253,7 +253,7 @@ def _existing_subjects(authority: _Authority, names: Iterable[str]) -> list[Subj
     for name in names:
         if name not in subjects:
             there = ", ".join(subjects)
-            raise InputError(f"{name[:80]!r}: has no certificate here; there are {there}")
+            raise InputError(f"{name[:80]}: has no certificate here, only {there} have")
     return [subjects[name] for name in dict.fromkeys(names)]
 
 

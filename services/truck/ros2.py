@@ -23,6 +23,7 @@ from services.bus.credentials import check_speaks_for
 from services.bus.playback import confirm, stopped_by_signals
 from services.bus.session import checked_realm, open_session
 from services.common.errors import FailureError, one_line
+from services.common.naming import count_of
 from services.drives.importing import vehicle_of
 from services.drives.ros2_anomalies import (
     DROPPED,
@@ -103,7 +104,8 @@ def run(asked: GatewaySettings, ready: Callable[[], None] = lambda: None) -> int
             out.put(item)
         reports.report(closing=True)
         confirm(gateway.delivery, out.sent, gateway.subscriber_complaint)
-        gateway.log.info("%d messages of %s published in realm %s", out.sent, vehicle, realm)
+        sent = count_of(out.sent, "message")
+        gateway.log.info("%s of %s published in realm %s", sent, vehicle, realm)
     return 0
 
 
@@ -327,7 +329,7 @@ class _RosSubscriptions:
         name = (topic, publisher)
         before = self._latest.get(name)
         if before is not None and sequence <= before:
-            anomalies.add(topic, "messages that came again, left out")
+            anomalies.add(topic, "messages received again, left out")
             return False
         if before is not None:
             anomalies.add(topic, "messages lost on the way", sequence - before - 1)

@@ -41,6 +41,7 @@ from services.bus.playback import (
 )
 from services.bus.session import checked_realm, open_session
 from services.common.errors import InputError
+from services.common.naming import count_of
 from services.recordings.recording import check_message, read_messages
 from services.truck.gateway import Connect, Gateway
 from services.truck.settings import TruckSettings
@@ -103,12 +104,15 @@ def run(asked: TruckSettings, *, connect_timeout_s: float | None = CONNECT_TIMEO
         confirm(gateway.delivery, sent, gateway.subscriber_complaint)
         if gateway.is_online:
             gateway.log.info(
-                "%d messages of %s published in realm %s", sent, gateway.vehicle, realm
+                "%s of %s published in realm %s",
+                count_of(sent, "message"),
+                gateway.vehicle,
+                realm,
             )
         else:
             gateway.log.warning(
-                "%d messages of %s are in the spool, none were published: no router answered at %s",
-                sent, gateway.vehicle, asked.address,
+                "%s of %s kept in the spool and none published, as no router answered at %s",
+                count_of(sent, "message"), gateway.vehicle, asked.address,
             )  # fmt: skip
     return 0
 
@@ -203,8 +207,8 @@ def _log_timing(times: _DriveTiming) -> None:
     if times.ahead_ns > _OLD_S * NS_PER_S:
         begins = datetime.fromtimestamp(time.time() - times.ahead_ns * 1e-9, UTC)
         _log.info(
-            "all times are shifted so that the drive ends as its publication does: it begins at %s "
-            "UTC, its first samples are %.0f s old when they are published",
+            "all times are shifted so that drive and publication end together; the drive begins "
+            "at %s UTC, and its first samples are %.0f s old when they are published",
             *(f"{begins:%Y-%m-%d %H:%M:%S}", times.ahead_ns * 1e-9),
         )
 

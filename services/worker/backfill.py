@@ -286,8 +286,8 @@ class Backfill:
             if self._is_final:
                 self._given_up.add(stay)
                 self._warn(
-                    f"{stay.vehicle} on {stay.bridge}: its recording has too little of a "
-                    "crossing to decide it"
+                    f"{stay.vehicle} on {stay.bridge}: its recording shows too little of the "
+                    "crossing to judge it"
                 )
             self._later[stay] = self._reads
 

@@ -80,10 +80,15 @@ def publish_health(
     """Publish `health`; `verdicts` are the results of this run, `note` why crossings wait."""
     running = execution.running
     now_s = time.time()
-    notes = [f"{name} is being identified since {_clock(now_s - s)} UTC" for name, s in running]
-    notes += [f"{load.waiting} wait for a process"] if load.waiting else []
+    notes = [f"identifying {name} since {_clock(now_s - s)} UTC" for name, s in running]
+    waiting = count_of(load.waiting, "crossing")
+    notes += [f"{waiting} waiting for a process"] if load.waiting else []
     recorded = load.in_recordings._asdict().items()
-    notes += [f"{n} in recordings wait {_CAUSES[cause]}" for cause, n in recorded if n]
+    notes += [
+        f"{count_of(n, 'crossing')} in recordings waiting {_CAUSES[cause]}"
+        for cause, n in recorded
+        if n
+    ]
     notes += [f"refused {count_of(behind.refused, 'invalid message')}"] if behind.refused else []
     notes += [note] if note else []
     figures = {

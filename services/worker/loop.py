@@ -238,7 +238,7 @@ class Loop:
         waiting = [name for names in self._engine.waiting().values() for name in names]
         if waiting:
             _log.warning(
-                "%d crossings still wait for a site validation or a process (%s): the next run "
-                "gets them from their trucks, or from the logger's recordings",
-                *(len(waiting), named(waiting)),
+                "%s still waiting for a site validation or a process (%s); the next run gets them "
+                "from their trucks or from the logger's recordings",
+                *(count_of(len(waiting), "crossing"), named(waiting)),
             )

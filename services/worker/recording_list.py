@@ -99,7 +99,9 @@ class RecordingList:
             self.groups += self._changed(vehicle, files, reading)
         if self._is_first and self.groups:
             paths = {file.path for group in self.groups for file in group.files}
-            _log.info("reading %s for crossings to catch up", count_of(len(paths), "recording"))
+            _log.info(
+                "reading %s for crossings without a result", count_of(len(paths), "recording")
+            )
         self._is_first = False
 
     def _by_vehicle(self, now: float) -> dict[str, list[_File]]:

@@ -146,7 +146,7 @@ def _check(asked: WorkerSettings) -> None:
         method = asked.search_method.replace("_", "-")
         raise InputError(
             f"--method {method}: has no site validation, which realm live and --validate-first "
-            "ask for; take pre, or --skip-validation"
+            "require; use --method pre or --skip-validation"
         )
 
 

@@ -22,6 +22,7 @@ from schemas.site import Site
 from schemas.topics import Message
 from services.bus.publisher import Publisher
 from services.common.errors import FailureError
+from services.common.naming import count_of
 from services.execution.dispatch import CrossingExecutor, dispatch
 from services.identification.bridge_state import FusionSettings
 from services.identification.engine import Engine
@@ -124,8 +125,9 @@ class WorkerService:
         self.process_outputs(finished)
         if earlier.previous is not None:
             _log.info(
-                "%d messages of earlier runs, the last in %s; republished %d, completed %d pending",
-                *(len(earlier.published), earlier.previous, len(again), len(finished)),
+                "%s of earlier runs, the last in %s; %d republished, %d pending results completed",
+                *(count_of(len(earlier.published), "message"), earlier.previous),
+                *(len(again), len(finished)),
             )
         waited = [
             known.crossing_id
@@ -134,9 +136,9 @@ class WorkerService:
         ]
         if waited:
             _log.warning(
-                "%d crossings waited for a site validation when an earlier run ended (%s): they "
-                "continue if their trucks still have them or they are in the logger's recordings",
-                *(len(waited), named(waited)),
+                "%s waited for a site validation when an earlier run ended (%s); identified later "
+                "if their trucks or the logger's recordings still have them",
+                *(count_of(len(waited), "crossing"), named(waited)),
             )
 
 

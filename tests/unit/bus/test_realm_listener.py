@@ -109,8 +109,8 @@ def test_a_truck_that_drives_in_another_realm_is_named(
     token = client.liveliness().declare_token(key("sim-x", "vehicle", "truck-1", "alive"))
     until(lambda: list(listening.heard()) or len(listening.elsewhere) == 2, "both realms")
     assert other_realms_hint("live", listening.elsewhere) == (
-        "nothing in realm live, but truck-7 in replay-monday and truck-1 in sim-x: "
-        "--realm replay-monday"
+        "nothing in realm live, but truck-7 in replay-monday and truck-1 in sim-x; "
+        "use --realm replay-monday"
     )
     token.undeclare()
     until(lambda: list(listening.heard()) or "sim-x" not in listening.elsewhere, "its leave")
@@ -126,7 +126,7 @@ def test_of_many_trucks_elsewhere_some_are_named() -> None:
     assert other_realms_hint("live", {}) is None
     trucks = {f"truck-{n}" for n in range(9)}
     assert other_realms_hint("live", {"sim-a": trucks}) == (
-        "nothing in realm live, but truck-0, truck-1, truck-2 … in sim-a: --realm sim-a"
+        "nothing in realm live, but truck-0, truck-1, truck-2 … in sim-a; use --realm sim-a"
     )
 
 

@@ -383,7 +383,7 @@ def test_without_room_for_a_copy_nothing_is_begun(
 ) -> None:
     usage = type("Usage", (), {"free": 1000})
     monkeypatch.setattr("services.common.stores.shutil.disk_usage", lambda _: usage)
-    with pytest.raises(FailureError, match=r"drive-00000.mcap: .* MB have no room in .*TMPDIR"):
+    with pytest.raises(FailureError, match=r"drive-00000.mcap: .* MB do not fit in .*TMPDIR"):
         done(tmp_path / "into", *away)
     assert list((tmp_path / "temporary").iterdir()) == []
 
@@ -394,7 +394,7 @@ def test_disk_filled_during_a_copy_is_reported_as_full(
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limit[1]))
     try:
-        with pytest.raises(FailureError, match=r"drive-00000.mcap: .* MB have no room in .*TMPDIR"):
+        with pytest.raises(FailureError, match=r"drive-00000.mcap: .* MB do not fit in .*TMPDIR"):
             done(tmp_path / "into", *away)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)

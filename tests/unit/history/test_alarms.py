@@ -103,7 +103,9 @@ def test_only_a_watch_that_judged_says_that_nothing_has_changed(history: Path) -
     check(history, AlarmSettings(learning=40), AFTER_S)
     training = watch_now(history)
     assert (training.state, training.found_nothing) == ("training", False)
-    assert training.sentence == ("Not monitored yet: 24 of 40 training weeks, up to 2025-06-23.")
+    assert training.sentence == (
+        "Not monitored yet: 24 of 40 training weeks are complete as of 2025-06-23."
+    )
     check(history, AlarmSettings(), AFTER_S)
     assert watch_now(history).found_nothing
     assert watch_now(history).sentence == (
@@ -150,8 +152,8 @@ def test_crossings_dated_in_the_future_are_named(history: Path) -> None:
     check(history, AlarmSettings(), now_s)
     found = watch_now(history, now_s=now_s)
     assert found.sentence == (
-        "Not monitored yet: 3 of 8 training weeks, up to 2025-01-27. Crossings dated after the "
-        f"check, up to {newest_day(history)}, do not count yet."
+        "Not monitored yet: 3 of 8 training weeks are complete as of 2025-01-27. Crossings dated "
+        f"after the check, up to {newest_day(history)}, do not count yet."
     )
     assert "nach der Prüfung" in found.words(language_of("de"))
     check(history, AlarmSettings(), AFTER_S)
@@ -195,8 +197,8 @@ def test_a_year_passes_before_an_unknown_season_is_judged(tmp_path: Path) -> Non
     assert (found.state, found.sentence) == (
         "season",
         (
-            "Not monitored yet: temperatures are unknown, so the seasonal effect is estimated for "
-            "a year, until 2026-01-05."
+            "Not monitored yet: temperatures are unknown, so the first year, until 2026-01-05, "
+            "only serves to estimate the seasonal effect."
         ),
     )
 
@@ -301,7 +303,7 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     output = capsys.readouterr().out
     assert output.startswith("2 bridges checked, 1 new alarm\nalarm 2025")
     assert "-4-weaker of bridge-2, raised 2025-" in output
-    how = "then acknowledge the alarm: driveby alarm ack BRIDGE --by NAME --note TEXT\n"
+    how = "then acknowledge the alarm with driveby alarm ack BRIDGE --by NAME --note TEXT\n"
     assert output.endswith(how)
     assert "\nan alarm compares periods; identify and fuse combine all crossings" in output
     assert "\n2 of 2 bridges are monitored\n" in output
@@ -317,7 +319,7 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     assert "--by NAME" in capsys.readouterr().err
     assert cli.main(["alarm", "check", "bridge-2", *there]) == 2
     assert cli.main(["history", "bridge-2", "--figures", str(tmp_path / "f"), *there]) == 0
-    assert "props; element 4 is" in capsys.readouterr().out
+    assert "(props)" in capsys.readouterr().out
 
 
 def test_unpublished_notes_are_published_at_the_start(history: Path) -> None:
@@ -377,7 +379,7 @@ def test_a_note_is_one_line_and_nothing_that_a_terminal_obeys(
     assert cli.main([*words, "--history", str(history)]) == 0
     (line,) = capsys.readouterr().out.splitlines()
     assert "acknowledged by an owner on" in line
-    assert "one\\x1b[2J two; element 4" in line
+    assert "(one\\x1b[2J two)" in line
 
 
 def test_an_alarm_in_another_place_than_its_own_gets_a_line(history: Path) -> None:
@@ -404,7 +406,7 @@ def test_an_alarm_stands_though_its_crossings_are_gone(
     assert cli.main(["alarm", "list", *there]) == 0
     assert "of bridge-2, raised" in capsys.readouterr().out
     assert cli.main(["alarm", "check", "--all", *there]) == 0
-    assert "active; element 4" in capsys.readouterr().out
+    assert "active: element 4" in capsys.readouterr().out
     assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", *there]) == 0
     assert standing_alarms(history) == ([], [])
 

@@ -179,7 +179,7 @@ def test_two_different_months_are_named_without_a_judgement(
     printed = capsys.readouterr().out
     assert never.text in printed
     assert outcome.text in printed
-    assert "take that of driveby report --baseline" in printed
+    assert "use driveby report --baseline" in printed
     kept = json.loads((tmp_path / "h.json").read_text())
     assert kept["watch"]["state"] == "never_checked"
     assert kept["comparison"]["elements"]["EI_4"]["q975"] == pytest.approx(of_it.high)

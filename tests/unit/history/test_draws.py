@@ -57,7 +57,9 @@ def test_the_draws_are_those_of_the_result_and_of_what_is_printed(
     assert f"probability of bearing compliance: {start}" in printed
     assert "weight of the body equations: 100 %" in printed
     # The state of the bridge, as the report has it, is not without the variability.
-    assert "\nwith between-crossing variability, as in reports: EI_4 0.4" in printed
+    assert (
+        "\nlowest EI/nominal, with between-crossing variability as in reports: EI_4 0.4" in printed
+    )
     assert "pareto_k" in crossing.diagnostics
 
 
@@ -160,7 +162,7 @@ def test_netcdf_without_its_extra_is_refused_before_any_work(
         (["--draws", "draws.csv"], "draws.csv: draws are written as .npz or .nc"),
         (
             ["--method", "least-squares", "--draws", "draws.npz"],
-            "--draws: method least_squares has no draws, pre has",
+            "--draws: method least_squares has no draws, use --method pre",
         ),
         (["--draws", "no/such/draws.npz"], "draws.npz"),
     ],

@@ -36,10 +36,9 @@ def passed_of(
 
 def untried(folder: Path) -> str:
     return (
-        "No site validation of truck-1 on this bridge in the folder "
-        f"{folder}: whether the intervals contain the truth has not been tested. Run "
-        "driveby validate --site SITE.toml, or name its folder "
-        "(--validations)."
+        f"The folder {folder} has no site validation of truck-1 on this bridge: whether the "
+        "intervals contain the truth has not been tested. Run driveby validate --site SITE.toml, "
+        "or name the right folder (--validations)."
     )
 
 
@@ -81,7 +80,7 @@ def test_record_of_the_pair_decides(site: Site, tmp_path: Path) -> None:
     (line,) = notes_of(tmp_path, site, [PAIR])
     assert line == (
         "Site validation of truck-1 on this bridge FAILED: 12 of 12 simulated crossings were good, "
-        "49 of 60 intervals contained the truth (at least 85 % must). Do not rely on the "
+        "and 49 of 60 intervals contained the truth (at least 85 % must). Do not rely on the "
         "intervals: check the site file, try fewer elements or a truck with equal single tyres or "
         "an equalised tandem, and validate again."
     )

@@ -11,7 +11,7 @@ def test_missing_end_of_a_file_is_no_loss_yet() -> None:
     text = recovery_text(Path("live/truck-1.mcap"), FOUND | {"lost": None})
     assert text.startswith("truck-1.mcap was cut off; 120 messages recovered to ")
     assert "the end of the file is missing" in text
-    assert text.endswith("those that cannot be fetched again count as missing or lost")
+    assert text.endswith("from the trucks again count as missing or lost")
     assert "unknown number lost" not in text
 
 

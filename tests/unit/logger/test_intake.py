@@ -226,7 +226,7 @@ def test_a_sequence_that_begins_again_with_other_content_is_refused_not_dropped(
     assert intake.counts == {"received": 2, "accepted": 1, "duplicates": 1}
     assert intake.accept(message(3, speed=11.0), NOW_NS) is None
     [(_, event)] = intake.report(*at(0.0))
-    assert "sequence 3 again, with another content" in event.text
+    assert "sequence 3 received again with other content" in event.text
 
 
 def test_an_impossible_rate_is_refused_but_no_replay_and_no_clock_that_stands_still() -> None:

@@ -197,7 +197,7 @@ def test_what_unpacks_to_gigabytes_is_not_gone_through(
     assert seen[0] < 900_000
     assert info.truncated
     assert info.damaged_chunks >= 1
-    with pytest.raises(InputError, match="holds nothing of an MCAP recording"):
+    with pytest.raises(InputError, match="holds nothing readable of an MCAP recording"):
         recover_recording(path, tmp_path / "out.mcap")
 
 

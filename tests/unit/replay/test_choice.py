@@ -118,9 +118,12 @@ def test_a_truck_is_renamed_and_a_result_of_that_name_is_not() -> None:
         ),
         (
             ReplaySelection(topics=("acc",)),
-            '--topics: "acc" fits nothing recorded: bridge/b/estimate, ',
+            '--topics: "acc" matches no topic of the recording, which has bridge/b/estimate, ',
         ),
-        (ReplaySelection(exclude=("health",)), '--exclude: "health" fits nothing recorded'),
+        (
+            ReplaySelection(exclude=("health",)),
+            '--exclude: "health" matches no topic of the recording',
+        ),
         (ReplaySelection(exclude=("*",)), "nothing is left to replay"),
         (ReplaySelection(topics=("gnss",), vehicles=("truck-2",)), "nothing is left to replay"),
     ],

@@ -225,7 +225,7 @@ def test_a_revoked_name_is_not_issued_again(folder: Path) -> None:
         ({"host": ["-x"], "renew": ["logger"]}, "the name or the address of a machine"),
         ({"host": ["a" * 60 + "."] * 1, "renew": ["logger"]}, "the name or the address"),
         ({"host": ["x.org"], "trucks": ["t"]}, "--host concerns routers and loggers"),
-        ({"renew": ["nobody"]}, "has no certificate here; there are logger"),
+        ({"renew": ["nobody"]}, "has no certificate here, only logger"),
         ({"revoke": ["nobody"]}, "has no certificate here"),
         ({"revoke": ["truck-1"], "renew": ["truck-1"]}, "either renew or revoke"),
     ],
@@ -337,10 +337,10 @@ def test_a_router_without_access_control_does_not_start(folder: Path) -> None:
     for wrong, message in (
         (
             text.replace('"enabled": true,\n    "default', '"enabled": false,\n    "default'),
-            "lets e",
+            "permits e",
         ),
-        (text.replace('"deny"', '"allow"'), "lets everybody do everything"),
-        ("{}", "lets everybody do everything"),
+        (text.replace('"deny"', '"allow"'), "permits everything to everybody"),
+        ("{}", "permits everything to everybody"),
         ("{", "zenoh.json5: "),
     ):
         assert wrong != text

@@ -106,7 +106,9 @@ def test_waiting_time_is_reported(caplog: pytest.LogCaptureFixture) -> None:
 def test_times_of_long_ago_are_explained(caplog: pytest.LogCaptureFixture) -> None:
     text = printed(caplog, 1.0, skip_gaps=True)
     assert "waiting" not in text
-    found = re.search(r"it begins at (\S+ \S+) UTC, its first samples are 600 s old", text)
+    found = re.search(
+        r"the drive begins at (\S+ \S+) UTC, and its first samples are 600 s old", text
+    )
     assert found
     begins_s = datetime.fromisoformat(f"{found[1]}+00:00").timestamp()
     assert begins_s == pytest.approx(time.time() - 600.0, abs=300.0)

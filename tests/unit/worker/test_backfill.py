@@ -160,7 +160,7 @@ def test_what_nobody_sends_any_more_gets_its_result_once(
     record(TWO)
     worker = Worker(tmp_path)
     assert ids(worker.go_on()) == IDS
-    assert caplog.text.count("reading 1 recording for crossings to catch up") == 1
+    assert caplog.text.count("reading 1 recording for crossings without a result") == 1
     assert sorted(worker.sent) == sorted(output_of(WHOLE))  # byte for byte, states too
     assert worker.backfill.waiting.total == 0
     assert worker.go_on() == []

@@ -34,8 +34,8 @@ def test_note_names_the_start_of_an_identification(monkeypatch: pytest.MonkeyPat
     )
     message = pb.Health.FromString(published[0])
     assert message.note == (
-        "a is being identified since 14:22:50 UTC; b is being identified since 14:23:16 UTC; "
-        "refused 2 invalid messages"
+        "identifying a since 14:22:50 UTC; identifying b since 14:23:16 UTC; refused 2 invalid "
+        "messages"
     )
     assert not re.search(r"for \d+ s", message.note)
     assert message.time_ns == round(1e9 * NOW_S)
