@@ -72,14 +72,14 @@ def plot_residual(solution: Solution | Identification) -> Figure:
                 color="C1",
                 alpha=_EXPECTED_OPACITY,
                 lw=0.0,
-                label=f"expected about the trend, 95 %: {_causes(solution)}",
+                label=f"expected range about the trend (95 %): {_causes(solution)}",
             )
         every, short = _rms(difference_mm), _rms(difference_mm - trend_mm)
         axes.plot(
             x_m,
             difference_mm,
             lw=0.8,
-            label=f"difference: {every:.2g} mm RMS, {short:.2g} without trend",
+            label=f"difference: {every:.2g} mm RMS, {short:.2g} mm without trend",
         )
         label = "cubic trend: mostly drift, little weight in the fit"
         axes.plot(x_m, trend_mm, lw=1.2, ls="--", color="C1", label=label)

@@ -17,6 +17,7 @@ from matplotlib.markers import CARETUP
 
 from services.common.arrays import Floats
 from services.common.language import ENGLISH, Language
+from services.common.naming import count_of
 from services.viewer.bridge_view import BridgeView, summary_of_bridge
 from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView
 from services.viewer.drawing import (
@@ -307,7 +308,7 @@ def _why_nothing(bridge: BridgeView) -> str:
     if not bridge.crossings:
         return "No truck has crossed this bridge."
     reasons = dict.fromkeys(text for c in bridge.crossings for text in c.reason_texts)
-    lines = ["No estimate, because"]
+    lines = ["No estimate. The reasons:"]
     return "\n".join([*lines, *(f"• {text}" for text in list(reasons)[:6])])
 
 
@@ -316,7 +317,7 @@ def _listed(bridge: BridgeView) -> list[_Line]:
     listed = bridge.crossings[-_MAX_LISTED:]
     more = len(bridge.crossings) - len(listed)
     rows = [line for crossing in reversed(listed) for line in _rows(bridge, crossing)]
-    return rows + ([_Line("", f"… and {more} earlier")] if more else [])
+    return rows + ([_Line("", f"… and {count_of(more, 'earlier crossing')}")] if more else [])
 
 
 def _list_crossings(figure: Figure, listed: Sequence[_Line], top: float, step: float) -> None:

@@ -249,7 +249,7 @@ def _draw_estimate(
     draw_bars(axes, places, estimate, numbers, doubtful=doubtful, unresolved=open_ones)
     if crossing.interval_nm2 is not None:
         colour = MUTED if doubtful else BAR_EDGE
-        label = "95 % interval" if crossing.interval_has_meaning else "interval (without meaning)"
+        label = "95 % interval" if crossing.interval_has_meaning else "interval (not valid)"
         draw_intervals(axes, places, (low, high), colour=colour, label=label, cut=cut)
     lowest, upper = np.minimum(estimate, low), np.minimum(cut, np.maximum(estimate, high))
     if before is None or found is None:

@@ -106,7 +106,7 @@ def _bridge(bridge: str) -> rrb.Container:
     infinite = rrb.TimeRangeBoundary.infinite()
     trend = rrb.TimeSeriesView(
         origin=trend_root(bridge),
-        name="Fused EI / nominal over time; white: lowest",
+        name="Fused EI / nominal over time; white: lowest element",
         axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=infinite, end=infinite)),
         axis_y=rrb.ScalarAxis(range=(0.0, 1.6)),
         time_ranges=[rrb.VisibleTimeRange(TIME, start=infinite, end=infinite)],

@@ -121,7 +121,7 @@ def log_roads(stream: TimestampedStream, root: str, crossing: CrossingView) -> N
     names = crossing.axle_names
     under = "both wheels" if crossing.first_axle == 1 else f"{names['front']} and {names['rear']}"
     apart_mm = 1e3 * float(np.sqrt(np.mean((road.front_m - road.rear_m) ** 2)))
-    label = f"road under {under}, ± {1e3 * largest_m:.1f} mm; they differ by {apart_mm:.2g} mm"
+    label = f"road under {under}, ± {1e3 * largest_m:.1f} mm, difference {apart_mm:.2g} mm (RMS)"
     place = np.array([STRIP_WIDTH / 2.0]), np.array([ROADS_MIDDLE + ROADS_REACH + 5.0])
     log_labels(stream, f"{entity}/name", [label], *place)
 

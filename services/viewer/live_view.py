@@ -212,7 +212,7 @@ class LiveView:
                 text += self._draw_result(view, view.rigidity_nm2, moment_ns)
                 self._below[crossing.bridge] = clock_text(crossing)
         if crossing.verdict == "rejected" and crossing.bridge in self._below:
-            text += f"\n\nBelow: still the crossing of {self._below[crossing.bridge]}."
+            text += f"\n\nBelow is still the crossing of {self._below[crossing.bridge]}."
         self._drawn[crossing.bridge] = (crossing.entry_time, text)
         self._draw_text(crossing.bridge, moment_ns)
 
@@ -236,7 +236,7 @@ class LiveView:
         unresolved = unresolved_elements(state.elements.values())
         described = describe_comparison(compared, unresolved, state.level)
         wording = state.finding or " ".join(described)
-        self._findings[bridge] = f"**All {used}:** {wording}" if used > 1 else ""
+        self._findings[bridge] = f"**All {used} crossings:** {wording}" if used > 1 else ""
         moment_ns = max(time_ns, self._lanes.end_ns(bridge))
         self._draw_text(bridge, moment_ns)
         if found is not None:

@@ -75,13 +75,15 @@ def recording_page(found: RecordingSummary) -> str:
             for gap in found.gaps[:_MAX_GAPS]
         ]
         if len(found.gaps) > _MAX_GAPS:
-            lines.append(f"- and {len(found.gaps) - _MAX_GAPS} more")
+            lines.append(f"- and {count_of(len(found.gaps) - _MAX_GAPS, 'more gap')}")
     lines += ["", f"Measurements only; to interpret them: `driveby identify {found.path.name}`."]
     return "\n".join(lines)
 
 
 def _crossings(passings: Sequence[DetectedCrossing]) -> Iterator[str]:
-    yield f"**Crossings seen: {len(passings)}**" if passings else "No crossing of a known bridge."
+    yield (
+        f"**Crossings detected: {len(passings)}**" if passings else "No crossing of a known bridge."
+    )
     yield ""
     for one in passings[-MAX_SHOWN:]:
         way = "→" if one.forward else "←"
@@ -89,7 +91,7 @@ def _crossings(passings: Sequence[DetectedCrossing]) -> Iterator[str]:
         how = f"{(one.exit_ns - one.entry_ns) * _S:.1f} s on it" if through else one.passage.value
         yield f"- {_moment(one.entry_ns)} {one.vehicle} {way} {one.bridge}, {how}"
     if len(passings) > MAX_SHOWN:
-        yield f"- and {len(passings) - MAX_SHOWN} earlier"
+        yield f"- and {count_of(len(passings) - MAX_SHOWN, 'earlier crossing')}"
 
 
 def _truck(truck: TruckSummary) -> str:

@@ -89,7 +89,7 @@ def _picture(history: HistoryView) -> NDArray[np.uint8]:
 def _history_text(history: HistoryView) -> str:
     lines = [f"# {history.bridge}", ""]
     for mark in history.marks:
-        state = f"noted by {mark.acknowledged}" if mark.acknowledged else "active"
+        state = f"acknowledged by {mark.acknowledged}" if mark.acknowledged else "active"
         lines.append(f"- Alarm of {utc_day(mark.raised_s)}, {state}: {mark.sentence}")
     for wording in history.statements:
         lines += ["", wording.text]

@@ -134,7 +134,7 @@ def test_query_of_the_wrong_realm_is_explained(
         while "nothing in realm" not in output and time.monotonic() < deadline:
             output = view.stderr.readline()
         assert output.endswith(
-            "nothing in realm live, but truck-1 in replay-monday: --realm replay-monday\n"
+            "nothing in realm live, but truck-1 in replay-monday; use --realm replay-monday\n"
         )
         publisher.close()
 

@@ -45,7 +45,7 @@ def _layout(scene: CrossingScene, _: Floats) -> rrb.Container:
         ),
         rrb.BarChartView(
             origin=f"{scene.root}/rigidity",
-            name=f"{doubt}EI (GN·m²) over m",
+            name=f"{doubt}EI (GN·m²) over chainage (m)",
             plot_legend=rrb.PlotLegend(visible=False),
         ),
         active_tab=0,

@@ -198,6 +198,6 @@ def test_crossing_is_compared_with_the_baseline_like_its_bridge(site: Site, verd
     assert "−60 %" in texts
     assert not any(text.endswith("less") for text in texts)
     written = "\n".join(text.get_text() for text in figure.texts)
-    said = "Element 4, 12.9 to 17.1 m: 60 % less stiff than the baseline" in written
+    said = "Element 4 (12.9 to 17.1 m) is 60 % less stiff than the baseline" in written
     assert said == (verdict == "good")
     assert_words_apart(figure)

@@ -108,13 +108,13 @@ def test_interval_truth_and_nominal_are_drawn_where_they_are() -> None:
 def test_ratio_axis_agrees_with_the_axis_of_rigidity() -> None:
     figure = draw(view())
     rigidity, ratio = figure.axes[0], figure.axes[-1]
-    assert ratio.get_ylabel() == "ratio to nominal"
+    assert ratio.get_ylabel() == "EI / nominal"
     assert np.array(rigidity.get_ylim()) == pytest.approx(np.array(ratio.get_ylim()) * 15.6)
 
 
 def test_no_ratio_axis_where_the_elements_have_different_nominal_values() -> None:
     figure = draw(view(nominal_nm2=np.linspace(10e9, 20e9, 7)))
-    assert not any(axes.get_ylabel() == "ratio to nominal" for axes in figure.axes)
+    assert not any(axes.get_ylabel() == "EI / nominal" for axes in figure.axes)
 
 
 def test_truth_is_neither_drawn_nor_named_where_there_is_none() -> None:
@@ -128,7 +128,7 @@ def test_interval_without_a_noise_model_is_named_as_such() -> None:
     )
     assert "95 % interval" in with_model
     assert "95 % interval" not in without
-    assert "interval (without meaning)" in without
+    assert "interval (not valid)" in without
 
 
 def test_rejected_crossing_shows_its_reason_and_no_number() -> None:

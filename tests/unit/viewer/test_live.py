@@ -311,7 +311,7 @@ def test_rejected_crossing_names_reason_and_source_of_numbers(live: Live, site: 
         assert bad.reason_texts[0] in text
         assert "EI_" not in text
     assert "Below" not in first
-    assert last.endswith("Below: still the crossing of 2026-09-21 14:13:20 UTC.")
+    assert last.endswith("Below is still the crossing of 2026-09-21 14:13:20 UTC.")
 
 
 def test_the_state_of_a_bridge_over_the_day(live: Live, site: Site) -> None:
@@ -365,7 +365,7 @@ def test_result_defines_the_elements_without_a_site_file(tmp_path: Path, site: S
     assert drawn[name].to_pylist() == [
         ["1.000", "0.980", "1.010", "0.400", "1.020", "1.000", "0.990"]
     ]
-    assert str(lowest_element(outcome)) == "EI_4 0.400 of nominal (95 %: 0.377 to 0.424)"
+    assert str(lowest_element(outcome)) == "EI_4 0.400 of nominal (95 % interval 0.377 to 0.424)"
     assert elements_of_result(result(site)) is None  # no priors in it
     assert lowest_element(result(site)) is None
 

@@ -86,7 +86,7 @@ def test_the_overview_has_the_picture_of_the_bridge_and_the_finding(
     (form,) = value(found["/bridge/bridge-1/picture"], "format")  # type: ignore[misc]
     assert form["width"] == 990  # not larger than it is shown: Rerun does not smooth what shrinks
     (text,) = value(found["/bridge/bridge-1/finding"], "text")  # type: ignore[misc]
-    assert "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements" in text
+    assert "Element 4 (12.9 to 17.1 m) is 60 % less stiff than the other elements" in text
     assert "Doubtful" not in text
 
 
@@ -96,7 +96,7 @@ def test_the_overview_has_the_picture_of_the_bridge_and_the_finding(
         (
             ("a",),
             0.02,
-            "One crossing; its own figure omits the between-crossing variability shown here.",
+            "Values from one crossing; its own figure has no between-crossing variability.",
         ),
         (("a",), None, "Values from one crossing."),
         (("a", "b"), 0.02, "Values from 2 fused crossings."),

@@ -75,7 +75,7 @@ def test_a_crossing_that_nobody_identified_is_shown_and_one_with_a_result_is_not
     known = some_crossing("a") | {"entry_time": entry, "exit_time": entry + 3.0}
     assert detected_views(found, results_of(site, known).crossings) == []
     page = recording_page(found)
-    assert "Crossings seen: 1" in page
+    assert "Crossings detected: 1" in page
     assert "truck-1 → bridge-1" in page
     assert "driveby identify run.mcap" in page
 
