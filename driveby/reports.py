@@ -49,10 +49,10 @@ def report(
     check_identifiers(
         [source.results for source in sources if isinstance(source, Identification | Fusion)]
     )
-    beside = Path(site).parent if isinstance(site, str | PathLike) else None
+    site_file = Path(site) if isinstance(site, str | PathLike) else None
     before = _baseline(sources, baseline)
     words = language_of(language)
-    reports = bridge_reports(files, before, beside, words)
+    reports = bridge_reports(files, before, site_file, words)
     write_atomically(path, page(reports, language=words))
     return path
 

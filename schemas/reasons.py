@@ -160,9 +160,9 @@ BRIDGE_REASON_TEXTS: Final[dict[BridgeReason, str]] = {
         "The method provides no likelihood to fuse; this is the latest crossing alone."
     ),
     BridgeReason.CROSSINGS_DISAGREE: (
-        "Over all elements or truck values together, crossings scatter by more than their "
-        "uncertainty explains, even if single intervals overlap; they are too few to show which "
-        "is wrong."
+        "Crossings scatter by more than their uncertainty explains, over all elements or truck "
+        "values together, even if single intervals overlap; they are too few to show which "
+        "crossing is wrong."
     ),
     BridgeReason.NEWEST_DISAGREE: (
         "The newest crossings disagree with the earlier ones, on which the values are based: the "

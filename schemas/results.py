@@ -379,7 +379,7 @@ def unresolved_note(crossing: CrossingResult) -> str | None:
     spread = 100.0 * level.std / level.mean
     elements = sum(name.startswith("EI_") for name in crossing.parameters)
     which = f"{len(open_ones)} of {elements} elements"
-    return f"overall stiffness {level.mean:.2f} of nominal ± {spread:.0f} %, {which} not resolved"
+    return f"overall stiffness / nominal {level.mean:.2f} ± {spread:.0f} %, {which} not resolved"
 
 
 class LowestElement(NamedTuple):
@@ -391,9 +391,11 @@ class LowestElement(NamedTuple):
     high: float | None
 
     def __str__(self) -> str:
-        """Return the text, such as EI_4 0.404 of nominal (95 %: 0.394 to 0.415)."""
-        interval = "" if self.low is None else f" (95 %: {self.low:.3f} to {self.high:.3f})"
-        return f"{self.name} {self.ratio:.3f} of nominal{interval}"
+        """Return the text, such as EI_4 0.404 of nominal (95 % interval 0.394 to 0.415)."""
+        if self.low is None:
+            return f"{self.name} {self.ratio:.3f} of nominal"
+        interval = f"95 % interval {self.low:.3f} to {self.high:.3f}"
+        return f"{self.name} {self.ratio:.3f} of nominal ({interval})"
 
 
 def lowest_element(crossing: CrossingResult) -> LowestElement | None:

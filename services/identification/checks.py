@@ -348,8 +348,10 @@ def undeclared_axles(
     if rear < max(least, _REAR_OVER_FRONT * front):
         return {}
     return {
-        Reason.MORE_AXLES_THAN_DECLARED: f"{100.0 * rear:.0f} % of its motion are unexplained, "
-        f"{100.0 * front:.0f} % at the front"
+        Reason.MORE_AXLES_THAN_DECLARED: (
+            f"{100.0 * rear:.0f} % of the rear's motion is unexplained, "
+            f"{100.0 * front:.0f} % of the front's"
+        )
     }
 
 

@@ -91,7 +91,7 @@ def reasons_of_fit(
         Reason.NOT_CONVERGED: _ending_of_search(found),
         Reason.NOISE_ABOVE_DECLARED: coarse,
         Reason.IMPLAUSIBLE_VEHICLE: odd_parameters(fit),
-        Reason.TANDEM_FRICTION: f"about {100.0 * fit.tandem_friction:.2g} % of their load",
+        Reason.TANDEM_FRICTION: f"about {100.0 * fit.tandem_friction:.2g} % of the springs' load",
     }
     return ReasonsOfFit((*axles, *reasons), about, bool(slipped) or is_biased_by_mismatch(fit))
 
@@ -142,8 +142,8 @@ def contradicted_frequency(fitted_hz: float, declared_hz: float) -> str:
     if 1.0 / _CONTRADICTION <= fitted_hz / declared_hz <= _CONTRADICTION:
         return ""
     return (
-        f"its first frequency is {fitted_hz:.3g} Hz, declared {declared_hz:.3g} Hz, so the search "
-        "may have ended at a wrong bridge"
+        f"the estimated first frequency is {fitted_hz:.3g} Hz, declared {declared_hz:.3g} Hz, so "
+        "the search may have ended at wrong bridge values"
     )
 
 

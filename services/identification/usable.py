@@ -14,8 +14,8 @@ from schemas.results import CrossingResult, ElementState, RoadResult, Verdict
 _log = logging.getLogger(__name__)
 
 ONE_REALM: Final = (
-    "fuse one realm at a time (import --realm NAME files the drives of a campaign in one; "
-    "simulated drives too, after export)"
+    "fuse one realm at a time (import --realm NAME puts the drives of a campaign into one realm; "
+    "so also simulated drives, after export)"
 )
 LISTED_AT_MOST = 100
 """Maximum number of fused crossings, the newest, and of named excluded ones.
@@ -103,7 +103,7 @@ def latest_realms(counted: Mapping[tuple[str, str], RecentCrossings]) -> dict[st
         latest[bridge] = last
         if len(some) > 1:
             listed = ", ".join(sorted(some))
-            text = "%s: crossings of %s, and only those of %s are fused; %s"
+            text = "%s: has crossings of realms %s; only those of %s are fused; %s"
             _log.warning(text, bridge, listed, last, ONE_REALM)
     return latest
 

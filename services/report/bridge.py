@@ -92,7 +92,7 @@ class BridgeReport(NamedTuple):
 def bridge_reports(
     files: Sequence[tuple[Path, Results, Site]],
     baseline: Path | NamedResults | None,
-    beside: Path | None = None,
+    site_file: Path | None = None,
     language: Language = ENGLISH,
     validations: Path = CERTIFICATES,
 ) -> list[BridgeReport]:
@@ -101,9 +101,9 @@ def bridge_reports(
     Of a crossing in several files the newest result counts (see `newest_of_each`). The numbers of a
     bridge are those of the state with the newest crossing; if other files have good crossings of
     its realm that are not in it, all are fused. `baseline` is a results file with which to compare,
-    read or not; otherwise the one that the site file names, whose folder is `beside` (default: that
-    of the results). `validations` is the folder of validation records. Raise InputError if a
-    baseline does not fit, or results do not fit their site file.
+    read or not; otherwise the one that the site file names, in the folder of `site_file`, the one
+    that was given (default: in that of the results). `validations` is the folder of validation
+    records. Raise InputError if a baseline does not fit, or results do not fit their site file.
     """
     for path, results, site in files:
         _check(path, results, site)
@@ -113,7 +113,7 @@ def bridge_reports(
         for bridge in site.bridges
         if any(crossing.bridge == bridge.id for crossing in results.crossings)
     )
-    return [_report(name, files, baseline, beside, language, validations) for name in names]
+    return [_report(name, files, baseline, site_file, language, validations) for name in names]
 
 
 def _check(path: Path, results: Results, site: Site) -> None:
@@ -135,7 +135,7 @@ def _report(
     name: str,
     files: Sequence[tuple[Path, Results, Site]],
     baseline: Path | NamedResults | None,
-    beside: Path | None,
+    site_file: Path | None,
     language: Language,
     validations: Path,
 ) -> BridgeReport:
@@ -150,11 +150,14 @@ def _report(
     bridges = {} if state is None else {name: state}
     merged = last.model_copy(update={"crossings": crossings, "bridges": bridges})
     bridge = site.bridge(name)
+    beside = None if site_file is None else site_file.parent
     before = before_of(bridge, baseline, path, beside)
     stored = None if before is None else before.estimate
     view = view_of_bridge(bridge, merged, stored)
     used = tuple(crossing for crossing in crossings if crossing.crossing_id in view.used)
-    combined = None if before is not None else combined_surveys(_survey_files(name, about), used)
+    combined = None
+    if before is None:
+        combined = combined_surveys(_survey_files(name, about), used, site_file)
     records = records_of(validations, site, pairs_with_intervals(used))
     unvalidated = {pair: records[pair] for pair in pairs_without_validation(used)}
     notes = tuple(validation_notes(validations, site, unvalidated, language))

@@ -183,7 +183,8 @@ def _seasons(measured: CautionBasis, language: Language) -> Iterator[str]:
 def _combined(combined: CombinedSurveys | None, language: Language) -> Iterator[str]:
     if combined is None:
         return
-    how = language.text("caution.no_command")
+    site = "" if combined.site_file is None else f" --site {combined.site_file}"
+    how = language.text("caution.no_command", site=site)
     if combined.command is not None:
         how = language.text("caution.command", command=combined.command)
     yield language.text(

@@ -58,6 +58,8 @@ class CombinedSurveys(NamedTuple):
     later_s: float
     command: str | None
     """Command that compares them; None if their results are in one file."""
+    site_file: str | None
+    """Name of the site file that was given; the command needs it, too."""
 
 
 def before_of(
@@ -81,7 +83,7 @@ def before_of(
 
 
 def combined_surveys(
-    files: Sequence[SurveyFile], crossings: Sequence[CrossingResult]
+    files: Sequence[SurveyFile], crossings: Sequence[CrossingResult], site_file: Path | None = None
 ) -> CombinedSurveys | None:
     """Return the last pause between surveys among the crossings of a state; None without one."""
     times = sorted(crossing.entry_time for crossing in crossings)
@@ -95,8 +97,11 @@ def combined_surveys(
     if earlier and later and len(earlier) + len(later) == len(files):
         baseline = max(earlier, key=lambda file: file.last_s)
         names = [file.name for file in sorted(later, key=lambda file: file.first_s)]
-        command = shlex.join(["driveby", "report", *names, "--baseline", baseline.name])
-    return CombinedSurveys(earlier_s, later_s, command)
+        site = [] if site_file is None else ["--site", site_file.name]
+        command = shlex.join(["driveby", "report", *names, "--baseline", baseline.name, *site])
+    return CombinedSurveys(
+        earlier_s, later_s, command, None if site_file is None else site_file.name
+    )
 
 
 def days_between(earlier_s: float, later_s: float) -> int:

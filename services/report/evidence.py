@@ -24,6 +24,8 @@ _COLUMNS = 6
 """Maximum number of crossings next to each other in a table of measures."""
 _COLUMNS_WITH_MEANINGS = 3
 _DIAGNOSTICS = ("r_hat", "ess", "pareto_k", "position_shift_m", "line_hz")
+_FORMATS = {"r_hat": ".3f", "pareto_k": ".3f"}
+"""Formats that show how near a value is to its limit, 1.05 and 0.7, in as many digits for all."""
 
 Numbered = tuple[int, CrossingResult]
 
@@ -150,7 +152,8 @@ def _reasons(numbered: Sequence[Numbered], language: Language) -> Iterator[Html]
     yield tag("h3", language.text("heading.reasons"))
     items = []
     for sentence, numbers in found.items():
-        which = language.text("crossings.of", numbers=", ".join(map(str, numbers)))
+        listed = ", ".join(map(str, numbers))
+        which = language.choice("crossings.of", len(numbers), numbers=listed)
         items.append(tag("li", f"{which}: {sentence} ", tag("em", advice[sentence])))
     yield tag("ul", *items)
 
@@ -221,8 +224,8 @@ def measures_of(crossing: CrossingResult, language: Language) -> Iterator[Measur
     for key in _DIAGNOSTICS:
         if key in crossing.diagnostics:
             value = crossing.diagnostics[key]
-            # The limit is 1.05: a plain 1 would hide how near a value is to it.
-            text = language.number(value, ".3f") if key == "r_hat" else _plain(value, language)
+            form = _FORMATS.get(key)
+            text = _plain(value, language) if form is None else language.number(value, form)
             yield Measure(key, key, text)
 
 

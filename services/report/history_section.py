@@ -60,7 +60,7 @@ def _how_much(past: BridgeHistory, language: Language) -> str:
     number = sum(one.crossings for one in past.periods)
     many = len(past.periods)
     unit = language.text(past.unit if many == 1 else f"{past.unit}s")
-    return language.text("history.how_much", number=number, periods=many, unit=unit)
+    return language.choice("history.how_much", number, periods=many, unit=unit)
 
 
 def _alarms(past: BridgeHistory, language: Language) -> Iterator[Html]:

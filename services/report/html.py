@@ -7,6 +7,7 @@ from html import escape
 from typing import Final
 
 _EMPTY: Final = frozenset({"meta", "br"})
+_OPTION: Final = re.compile(r"--[a-z][a-z-]*")
 
 
 class Html(str):
@@ -27,12 +28,13 @@ def tag(name: str, /, *children: str, **attributes: str) -> Html:
 
 
 def joined(*children: str) -> Html:
-    """Return several pieces, one after the other; no line of text begins with a %."""
-    return Html(
-        "".join(
-            c if isinstance(c, Html) else escape(c).replace(" %", "\N{NO-BREAK SPACE}%")
-            for c in children
-        )
+    """Return several pieces, one after the other; no line begins with a % or within an option."""
+    return Html("".join(c if isinstance(c, Html) else _unbroken(escape(c)) for c in children))
+
+
+def _unbroken(text: str) -> str:
+    return _OPTION.sub(
+        r'<span class="option">\g<0></span>', text.replace(" %", "\N{NO-BREAK SPACE}%")
     )
 
 

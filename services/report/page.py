@@ -203,7 +203,8 @@ def _result(
                 counted[text] = counted.get(text, 0) + 1
         total = len(report.crossings)
         rows = sorted(counted.items(), key=lambda item: -item[1])
-        yield _list([language.text("why", reason=t, number=n, total=total) for t, n in rows])
+        which = "why.one" if total == 1 else "why.many"
+        yield _list([language.text(which, reason=t, number=n, total=total) for t, n in rows])
         return
     with matplotlib.rc_context(STYLE):
         figure = draw_bridge(view, with_heading=False, language=language)

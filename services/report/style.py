@@ -36,6 +36,7 @@ svg { width: 100%; height: auto; display: block; }
 .about .facts { flex: 1; min-width: 0; }
 .sketch { flex: 0 0 36mm; }
 .sketch text { font: 11px "DejaVu Sans", Verdana, Arial, sans-serif; fill: #3d4650; }
+.option { white-space: nowrap; }
 .wide { overflow-x: auto; }
 .wide th:first-child { white-space: nowrap; }
 .first .wide td { white-space: nowrap; }
@@ -73,6 +74,7 @@ tr.good td:first-child::before { content: "● "; }
   figure, tr, .finding { break-inside: avoid; }
   .past, .words + .first { break-before: page; }
   .evidence table { font-size: 8.2pt; }
+  .evidence .facts { break-inside: avoid; }
   .evidence figure svg { max-height: 54mm; }
   .measures table { font-size: 7.8pt; }
   .measures td, .measures th { padding-top: 0.2mm; padding-bottom: 0.2mm; line-height: 1.25; }

@@ -85,9 +85,8 @@ def _report(asked: ReportOptions) -> int:
     for path in asked.results:
         results = load_results(path)
         files.append((path, results, site_of_results(path, results, asked.site)))
-    beside = None if asked.site is None else asked.site.parent
     language = language_of(asked.language)
-    reports = bridge_reports(files, asked.baseline, beside, language, records)
+    reports = bridge_reports(files, asked.baseline, asked.site, language, records)
     if asked.history is not None:
         reports = with_histories(reports, asked.history, asked.period, print, language)
     with steps_bar(f"drawing {output}") as progress:
@@ -100,9 +99,10 @@ def _report(asked: ReportOptions) -> int:
     if not reports:
         print("no crossing of a known bridge")
     if asked.baseline is None and len(files) > 1:
+        given = "" if asked.site is None else f" --site {asked.site}"
         print(
             "the crossings of all files are fused; to see what has changed between surveys: "
-            "driveby report LATER.json --baseline EARLIER.json"
+            f"driveby report LATER.json --baseline EARLIER.json{given}"
         )
     print(output)
     if asked.pdf:

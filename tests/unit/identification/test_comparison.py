@@ -44,7 +44,7 @@ def test_a_weak_element_is_named_with_its_place_loss_and_interval() -> None:
     assert (weak.low, weak.high) == pytest.approx((0.4 * np.exp(-half), 0.4 * np.exp(half)), 1e-3)
     assert sentences(found) == [
         (
-            "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements "
+            "Element 4 (12.9 to 17.1 m) is 60 % less stiff than the other elements "
             "(95 % interval 57 to 63 %)."
         ),
         ENGLISH.text("rest.others", within=3),
@@ -125,8 +125,10 @@ def test_weak_elements_come_first_and_stiffer_ones_are_named() -> None:
     assert [element.number for element in found.weak] == [4, 2]
     assert [element.number for element in found.stiff] == [6]
     output = sentences(found)
-    assert output[0].startswith("Element 4, 12.9 to 17.1 m: 70 % less stiff")
-    assert output[2].startswith("Element 6, 21.4 to 25.7 m: 50 % stiffer than the other elements")
+    assert output[0].startswith("Element 4 (12.9 to 17.1 m) is 70 % less stiff")
+    assert output[2].startswith(
+        "Element 6 (21.4 to 25.7 m) is 50 % stiffer than the other elements"
+    )
 
 
 def test_bridges_of_unequal_elements_are_compared_by_pattern() -> None:
@@ -223,10 +225,10 @@ def test_unresolved_elements_are_never_stated_to_agree() -> None:
     assert describe_comparison(found) == sentences(found)
     assert describe_comparison(found, frozenset({1, 5}), LEVEL) == [
         (
-            "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements "
+            "Element 4 (12.9 to 17.1 m) is 60 % less stiff than the other elements "
             "(95 % interval 57 to 63 %)."
         ),
-        "The loss may also be in element 5, which is adjacent.",
+        "The loss may also be in the adjacent element 5.",
         "Elements 1 and 5 are not resolved (standard deviation above 25 %).",
         ENGLISH.text("rest.resolved", loss=21),
         "The overall stiffness is 0.90 times the nominal value, ± 10 %.",
@@ -238,9 +240,9 @@ def test_unresolved_elements_are_never_stated_to_agree() -> None:
     ]
     assert describe_comparison(sound, frozenset({7}), without=("detectable", "unresolved")) == []
     (only,) = sentences(sound, without=("detectable",))
-    assert only == "No element differs clearly from the others (estimates within 1 %)."
+    assert only == "No element differs clearly from the others (estimated at most 1 %)."
     both = describe_comparison(found, frozenset({3, 5}))
-    assert both[1] == "The loss may also be in element 3 or 5; these are adjacent."
+    assert both[1] == "The loss may also be in the adjacent element 3 or 5."
     every = describe_comparison(sound, frozenset(range(1, 8)))
     assert every == ["No single element is resolved (standard deviation above 25 %)."]
 

@@ -40,5 +40,5 @@ def test_misfit_names_a_first_frequency_far_from_the_declared_one(
     problem = SimpleNamespace(crossing=SimpleNamespace(basis=None))
     found: Any = SimpleNamespace(problem=problem, state=SimpleNamespace(y=np.zeros(1)))
     seen = _wrong_bridge(data, found)
-    expected = f"its first frequency is {fitted_hz} Hz, declared {declared_hz} Hz, so the search"
+    expected = f"the estimated first frequency is {fitted_hz} Hz, declared {declared_hz} Hz, so"
     assert seen.startswith(expected) if is_named else seen == ""

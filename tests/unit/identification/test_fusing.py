@@ -147,7 +147,7 @@ def test_many_crossings_are_one_estimate() -> None:
     assert found.elements["EI_1"].std / NOMINAL < 0.025
     assert found.probability_of_loss is None
     assert found.finding is not None
-    assert "Element 3, 12.0 to 18.0 m: " in found.finding
+    assert "Element 3 (12.0 to 18.0 m) is " in found.finding
     assert found.thirds is not None
     assert found.thirds.middle.mean < found.thirds.left.mean
     assert found == state(crossings[::-1])
@@ -247,7 +247,7 @@ def test_element_unresolved_in_the_baseline_gets_no_claim() -> None:
     assert now.finding is not None
     assert "Element 2 is not resolved in the baseline (standard deviation above" in now.finding
     assert "Element 2, 6.0" not in now.finding
-    assert "The loss may also be in element 2" in now.finding
+    assert "The loss may also be in the adjacent element 2" in now.finding
     assert "The baseline is a suspect measurement" in now.finding
     derived = against(crossing(20), before).derived
     assert derived is not None
@@ -339,13 +339,13 @@ def test_the_command_fuses_files(tmp_path: Path, capsys: pytest.CaptureFixture[s
     out = tmp_path / "out.json"
     assert main(["fuse", str(one), str(other), "--json", str(out)]) == 0
     output = capsys.readouterr().out
-    assert "bridge-1, 5 crossings together" in output
+    assert "bridge-1, 5 crossings fused" in output
     assert "measurement good" in output
     found = load_results(out)
     assert len(found.crossings) == 5
     assert len(found.bridges["bridge-1"].crossings_used) == 5
     assert main(["fuse", str(one), "--baseline", str(out)]) == 0
-    assert "lost 10/20/30" in capsys.readouterr().out
+    assert "loss>10/20/30" in capsys.readouterr().out
 
 
 def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

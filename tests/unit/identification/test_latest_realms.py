@@ -30,5 +30,5 @@ def test_last_crossing_decides_and_the_others_are_named(
         assert latest_realms(counted) == {"bridge-1": "a-last", "bridge-2": "z-first"}
     (line,) = caplog.messages
     assert line.startswith(
-        "bridge-1: crossings of a-last, z-first, and only those of a-last are fused; fuse one realm"
+        "bridge-1: has crossings of realms a-last, z-first; only those of a-last are fused; "
     )

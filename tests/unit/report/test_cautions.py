@@ -69,9 +69,11 @@ def test_implausible_stiffness_takes_certainty_from_headline(site: Site) -> None
         "plausible."
     )
     text = first_page(reported(site, stiff))
-    assert "Not plausible: the 95 % interval of element 5 lies wholly more than 20 % above" in text
+    assert (
+        "Not plausible: the 95 % interval of element 5 lies entirely more than 20 % above" in text
+    )
     assert "treat no value as certain, least of all those of elements 4 and 6" in text
-    assert "all checks passed; none explains the implausible stiffness" in text
+    assert "All checks passed, but none explains the implausible stiffness" in text
     assert "If the drawings show nothing stiffer at element 5, check mass" in text
     assert re.search(r"17\.1–21\.4 .{,60} not plausible", text)
     usual = first_page(reported(site, results_of(site, some_crossing("a"), used="a")))
@@ -96,7 +98,7 @@ def test_implausible_stiffness_alone_is_never_reassuring(site: Site) -> None:
 def test_gain_against_a_baseline_is_implausible_without_repair(site: Site, then: Path) -> None:
     text = first_page(reported(site, changed(site, 1.5), baseline=then))
     assert "But element 2 appears stiffer than is physically plausible." in text
-    assert "Without a repair no bridge becomes so much stiffer, not even by frost." in text
+    assert "Without a repair no bridge becomes that much stiffer, not even by frost." in text
     assert "plausible" not in first_page(reported(site, changed(site, 1.1), baseline=then))
 
 
@@ -104,7 +106,7 @@ def test_rise_against_a_baseline_has_a_remark_and_likely_causes(site: Site, then
     text = first_page(reported(site, changed(site, 1.12), baseline=then))
     assert re.search(r"4\.3–8\.6 .{,80} possibly stiffer", text)
     assert "Stiffer than the baseline: element 2 (+12 %, 95 % interval +" in text
-    assert "Unless it was repaired, the usual cause is a bearing that is restrained" in text
+    assert "Unless it was repaired, the usual cause is a bearing that now restrains" in text
     clear = first_page(reported(site, changed(site, 1.22), baseline=then))
     assert "Stiffer than the baseline: element 2" in clear
     assert re.search(r"4\.3–8\.6 .{,80} stiffer", clear)
@@ -127,7 +129,9 @@ def test_implausible_baseline_takes_certainty_from_changes(site: Site, tmp_path:
     stiff = results_of(site, some_crossing("b"), used="b", ratios=ratios)
     path = tmp_path / "stiff.json"
     path.write_text(results_json(stiff))
-    words = "The baseline is not plausible: the 95 % interval of element 5 lies wholly more than 20"
+    words = (
+        "The baseline is not plausible: its 95 % interval of element 5 lies entirely more than 20"
+    )
     now = results_of(site, some_crossing("z"), used="z")
     assert words in first_page(reported(site, now, baseline=path))
     assert "The baseline is not plausible" not in first_page(reported(site, now))
@@ -173,7 +177,7 @@ def test_interval_without_zero_is_possibly_less_stiff(site: Site, then: Path) ->
 def test_element_weak_in_the_baseline_is_named(site: Site, then: Path) -> None:
     text = first_page(reported(site, changed(site, 0.7), baseline=then))
     assert re.search(
-        r"Element 4 \(60 %, 95 % interval \d\d to \d\d %\) was clearly less stiff", text
+        r"Element 4 \(60 %, 95 % interval \d\d to \d\d %\) was already clearly less stiff", text
     )
     assert "If element 4 has not been inspected since the baseline, have it inspected, too." in text
     assert re.search(r"12\.9–17\.1 .{,60} less stiff before", text)
@@ -270,7 +274,15 @@ def test_combined_surveys_are_announced_with_the_command(site: Site, then: Path)
     assert "To see the change: driveby report 1.json --baseline 0.json" in text
     together = second.model_copy(update={"crossings": first.crossings + second.crossings})
     text = first_page(reported(site, together))
-    assert "identify each into a results file of its own, then run driveby report LATER" in text
+    assert (
+        "identify each survey into a results file of its own, then run driveby report LATER" in text
+    )
+    given = Path("there/site.toml")
+    words = "driveby report 1.json --baseline 0.json --site site.toml"
+    files = [(Path(f"{n}.json"), one, site) for n, one in enumerate((first, second))]
+    assert words in " ".join(bridge_reports(files, None, given)[0].cautions)
+    words = "driveby report LATER.json --baseline EARLIER.json --site site.toml."
+    assert words in " ".join(bridge_reports([(Path("a"), together, site)], None, given)[0].cautions)
     assert "combined" not in first_page(reported(site, *surveys(site, 3.0 * 86400.0)))
     assert "are combined" not in first_page(reported(site, first, second, baseline=then))
 
@@ -278,8 +290,11 @@ def test_combined_surveys_are_announced_with_the_command(site: Site, then: Path)
 @pytest.mark.parametrize(
     ("realms", "words"),
     [
-        (("sim-a", "import-drives"), "The baseline was simulated, these crossings were measured"),
-        (("live", "sim-a"), "These crossings were simulated, the baseline was measured"),
+        (
+            ("sim-a", "import-drives"),
+            "The baseline was simulated and these crossings were measured",
+        ),
+        (("live", "sim-a"), "These crossings were simulated and the baseline was measured"),
         (("sim-a", "sim-b"), ""),
         (("import-2025", "live"), ""),
     ],
@@ -303,7 +318,10 @@ def test_comparison_of_the_same_crossings_is_announced(site: Site, tmp_path: Pat
     results = results_of(site, some_crossing("a"), used="a")
     path.write_text(results_json(results))
     text = first_page(reported(site, results, baseline=path))
-    assert "The baseline has the same crossings: a measurement is compared with itself" in text
+    assert (
+        "The baseline consists of the same crossings: the measurement is compared with itself"
+        in text
+    )
     more = results_of(site, some_crossing("a"), some_crossing("b", entry=60.0), used="b")
     state = more.bridges["bridge-1"].model_copy(update={"crossings_used": ("a", "b")})
     more = more.model_copy(update={"bridges": {"bridge-1": state}})
@@ -334,7 +352,7 @@ def test_finding_names_the_change_over_time(site: Site, tmp_path: Path, code: st
     before = report_on(site, results_of(site, some_crossing("a"), used="a"), baseline=path)
     first, *_ = with_history(before, past, language).cautions
     assert first.startswith(language.text("caution.baseline", over_time=""))
-    assert {"en": "The change to state is the one above", "de": "Anzugeben ist die Änderung oben"}[
+    assert {"en": "Quote the change stated above", "de": "Geben Sie die Änderung oben an"}[
         code
     ] in first
     assert "--baseline" not in first
@@ -400,7 +418,7 @@ def test_likely_restraint_is_on_the_first_page_unless_declared(site: Site) -> No
     plain = fused(site, KNOWN)
     text = first_page(reported(site, with_ends(plain, 0.998, 0.95)))
     assert "abutment, is likely at the south-west end (probability 99 %). The" in text
-    assert "loose bearing, is likely at the north-east end (probability 95 %). The" in text
+    assert "loose bearing) is likely at the north-east end (probability 95 %). The" in text
     unlikely = first_page(reported(site, with_ends(plain, 0.8, 0.8)))
     assert "Rotational restraint" not in unlikely
     assert "Bearing compliance" not in unlikely
@@ -408,7 +426,7 @@ def test_likely_restraint_is_on_the_first_page_unless_declared(site: Site) -> No
     declared = site.model_copy(update={"bridges": (bridge,)})
     text = first_page(reported(declared, with_ends(plain, 0.998, 0.95)))
     assert "Rotational restraint" not in text
-    assert "Bearing compliance, vertical yielding under the load" in text
+    assert "Bearing compliance (vertical movement under the load" in text
 
 
 def test_excluded_crossings_have_number_and_reason(site: Site) -> None:

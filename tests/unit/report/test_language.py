@@ -130,7 +130,10 @@ def test_german_misfit_names_place_and_frequency_in_german() -> None:
         )
         (stored,) = texts([Reason.MODEL_MISFIT], {Reason.MODEL_MISFIT: details})
         german = GERMAN.reason("model_misfit", stored)
-        assert "Hz, angegeben sind 3.3 Hz, daher kann die Suche bei einer falschen" in german
+        assert (
+            "Hz, angegeben sind 3.3 Hz, daher kann die Suche bei falschen Werten der Brücke"
+            in german
+        )
         assert not re.search(r"\b(the|and|bridge|likely|search|declared)\b", german), german
 
 
@@ -175,7 +178,7 @@ def test_a_german_report_has_no_english_sentence(site: Site, tmp_path: Path) -> 
     for text in texts:
         assert [part for part in parts if part in text] == []
     assert "Ein Element ist deutlich weniger steif." in texts[1]
-    assert "Element 4, 12,9 bis 17,1 m: 60 % weniger steif als die anderen" in texts[1]
+    assert "Element 4 (12,9 bis 17,1 m) ist 60 % weniger steif als die anderen" in texts[1]
     assert "Noch kein verlässliches Ergebnis." not in texts[1]
 
 
