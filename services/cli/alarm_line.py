@@ -14,8 +14,8 @@ def alarm_line(alarm: "Alarm") -> str:
 
     note = alarm.acknowledged
     state = "active" if note is None else f"acknowledged by {note.by} on {utc_day(note.time)}"
-    text = f": {note.note}" if note is not None and note.note else ""
+    text = f" ({note.note})" if note is not None and note.note else ""
     return one_line(
-        f"alarm {alarm.alarm_id} of {alarm.bridge}, raised {utc_day(alarm.raised)}, {state}{text}; "
-        f"{alarm.sentence()}"
+        f"alarm {alarm.alarm_id} of {alarm.bridge}, raised {utc_day(alarm.raised)}, {state}: "
+        f"{alarm.sentence()}{text}"
     )

@@ -75,7 +75,7 @@ def serve(
             publisher = publishers.setdefault(alarm.realm, Publisher(session, alarm.realm))
             publisher.put("bridge", alarm.bridge, "alarm", payload)
             state = "acknowledged" if alarm.acknowledged else "active"
-            print(f"{alarm.bridge}: {alarm.sentence()}: {state}", flush=True)
+            print(f"alarm of {alarm.bridge}, {state}: {alarm.sentence()}", flush=True)
 
         alarms = AlarmPublisher(put)
         alarms.publish_changes(folder, time.time_ns())  # a check may take minutes

@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 _ENOUGH_RUNS = 5
 """Runs of a wheel-path group from which their lateral wander is known to a third."""
 _NO_CHANGE = (
-    "all crossings are combined here; whether EI changed between them: driveby history, driveby "
-    "alarm check"
+    "all crossings are combined here; driveby history and driveby alarm check show whether EI "
+    "changed between them"
 )
 
 _NO_BASELINE = (
-    "no baseline: elements are compared with each other only; a loss since an earlier survey is "
-    "found by --baseline EARLIER.json"
+    "no baseline: elements are compared with each other only; to find a loss since an earlier "
+    "survey, give --baseline EARLIER.json"
 )
 
 
@@ -71,7 +71,7 @@ def print_bridge(
     """
     used, left = len(state.crossings_used), state.crossings_left_out_count
     console.print(
-        f"[bold]{bridge.id}[/], {count_of(used, 'crossing')} together"
+        f"[bold]{bridge.id}[/], {count_of(used, 'crossing')} fused"
         + (f", {left} excluded" if left else ""),
         highlight=False,
     )
@@ -136,9 +136,9 @@ def level_lines(
     """Yield the overall stiffness, unless it is stated already, and that of the thirds."""
     parts = (thirds.left, thirds.middle, thirds.right)
     if not is_stated:
-        yield f"overall stiffness: {level.mean:.2f} ± {level.std:.2f} of nominal"
+        yield f"overall stiffness / nominal: {level.mean:.2f} ± {level.std:.2f}"
     listed = ", ".join(f"{part.mean:.2f} ± {part.std:.2f}" for part in parts)
-    yield f"thirds of the bridge: {listed} (standard deviations)"
+    yield f"by thirds of the bridge: {listed} (± standard deviation)"
 
 
 def states_level(state: BridgeResult) -> bool:
@@ -153,14 +153,14 @@ def _of_state(state: BridgeResult, crossings: Sequence[CrossingResult]) -> Itera
         yield from level_lines(state.level, state.thirds, is_stated=states_level(state))
     if state.between_crossing_std is not None and len(state.crossings_used) == 1:
         yield (
-            "single crossing: intervals include the between-crossing variability, which one "
-            "crossing cannot estimate"
+            "single crossing: intervals include the between-crossing variability, which cannot be "
+            "estimated from one crossing"
         )
     if state.between_crossing_std is not None and len(state.crossings_used) > 1:
         low, high = state.between_crossing_std_q025, state.between_crossing_std_q975
         yield (
-            f"between-crossing variability of EI: {100.0 * state.between_crossing_std:.1f} %, "
-            f"{100.0 * (low or 0.0):.1f} to {100.0 * (high or 0.0):.1f} %"
+            f"between-crossing variability of EI: {100.0 * state.between_crossing_std:.1f} % "
+            f"(95 % interval {100.0 * (low or 0.0):.1f} to {100.0 * (high or 0.0):.1f} %)"
         )
     for track in state.tracks:
         wander = ""
@@ -168,8 +168,8 @@ def _of_state(state: BridgeResult, crossings: Sequence[CrossingResult]) -> Itera
             wander = f", lateral wander {_wander(track.wander_m, *_runs(state, track, crossings))}"
         yield (
             f"wheel-path group of {track.vehicle}, {track.direction.replace('_', ' ')}{wander}: "
-            f"{100.0 * track.common_share:.0f} % of the profile mismatch is common to all runs, "
-            "so more runs there average out only the rest"
+            f"{100.0 * track.common_share:.0f} % of the profile mismatch is common to all runs; "
+            "more runs of this group average out the rest only"
         )
 
 
@@ -181,7 +181,7 @@ def _wander(wander_m: float, runs: float, is_exact: bool) -> str:
     if runs >= _ENOUGH_RUNS:
         return f"{wander_m:.2f} m"
     number = f"{'' if is_exact else 'about '}{count_of(round(runs), 'run')}"
-    return f"{wander_m:.2f} m (poorly known from {number}, partly a usual value)"
+    return f"{wander_m:.2f} m (poorly known from {number}, so partly a typical value)"
 
 
 def _runs(
@@ -237,7 +237,7 @@ def print_elements(
         table.add_column("95 % interval", justify="right")
     percents = list(next(iter(losses.values()))) if losses else []
     if losses:
-        table.add_column(f"probability\nlost {'/'.join(percents)}", justify="right")
+        table.add_column(f"probability\nloss>{'/'.join(percents)}", justify="right")
     start, unresolved, doubt = 0.0, unresolved_elements(every), "?" if is_doubtful else ""
     for number, (length, sound) in enumerate(
         zip(bridge.lengths_m, bridge.nominal_flexural_rigidity_nm2, strict=True), start=1

@@ -371,7 +371,7 @@ def _print(console: "Console", crossing: CrossingResult, drive: SimulatedDrive, 
         if p is None:
             table.add_row(f"EI_{number}", f"{truth:.3f}", "—", "—", "—")
             continue
-        interval, holds = "means nothing *", "—"
+        interval, holds = "not valid *", "—"
         if has_meaning:
             interval = f"{p.q025 / sound:.3f} … {p.q975 / sound:.3f}"
             holds = "yes" if p.q025 <= truth * sound <= p.q975 else "no"

@@ -11,6 +11,7 @@ from services.cli.identify import print_validation, warn_of_baselines
 from services.cli.settings import FuseOptions
 from services.common.errors import InputError
 from services.common.files import check_writable, write_atomically
+from services.common.naming import count_of
 from services.common.options import validations_folder
 from services.common.progress import Steps, parts_bar, steps_bar
 from services.execution.fuse_results import crossings_to_fuse, fuse_crossings
@@ -42,8 +43,8 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
     again = found.repeated
     if again:
         console.print(
-            f"{again} result{'s' if again > 1 else ''} of crossings that another file has too: the "
-            "newest counts",
+            f"{count_of(again, 'result')} of crossings that are also in another file; the newest "
+            "result of a crossing counts",
             highlight=False,
         )
     stored = _baselines(baseline, asked.site)
@@ -56,7 +57,9 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
             fuse_suspect=asked.fuse_suspect,
         )
     for name, number in fused.unfused.items():
-        console.print(f"{name}: none of {number} crossings can be fused", highlight=False)
+        console.print(
+            f"{name}: none of its {count_of(number, 'crossing')} can be fused", highlight=False
+        )
     for number, (name, elements) in enumerate(fused.bridges.items()):
         if number > 0:
             console.print()
@@ -105,7 +108,7 @@ def _print_validations(
         for pair in pairs_without_validation(fused.crossings):
             console.print(
                 f"{pair}: the results name no passed site validation; "
-                "with --site SITE.toml it is looked up",
+                "give --site SITE.toml to search for its record",
                 highlight=False,
                 soft_wrap=True,
             )

@@ -125,7 +125,7 @@ def _check(
     if asked.draws is not None:
         check_draws(asked.draws, asked.search_method)
         if executing is not None:
-            raise InputError("--draws: are kept in this process only, leave --scheduler out")
+            raise InputError("--draws: draws are kept in this process only; leave --scheduler out")
     for path in (asked.json, asked.rrd, asked.draws):
         if path is not None:
             check_writable(path)
@@ -139,7 +139,7 @@ def check_no_tables(source: Source) -> None:
     """Raise InputError if a local folder has CSV files and no recording."""
     if isinstance(source, Path) and any(source.glob("*.csv")) and not any(source.rglob("*.mcap")):
         raise InputError(
-            f"{source}: is a folder of CSV files, recordings are expected: "
+            f"{source}: is a folder of CSV files, a recording is expected; "
             f"driveby import {source} --site SITE.toml -o DRIVE.mcap makes one"
         )
 
@@ -199,8 +199,8 @@ def warn_of_no_noise(site: Site, method: str) -> None:
     """Warn where a method cannot use sensors without noise."""
     if lacks_noise(site, method):
         _log.warning(
-            "the site declares sensors without noise, which method pre cannot use; "
-            "simulations without noise are for --method least-squares"
+            "noise_density_ug_per_rthz in [sensor] of the site file is 0, which method pre cannot "
+            "use; simulations without noise are for --method least-squares"
         )
 
 
@@ -302,7 +302,7 @@ def _as_state(bridge: Bridge, state: BridgeResult) -> str:
         for (name, one), ei in zip(state.elements.items(), nominal, strict=True)
     )
     return (
-        f"with between-crossing variability, as in reports: {name} {ratio:.3f} "
+        f"lowest EI/nominal, with between-crossing variability as in reports: {name} {ratio:.3f} "
         f"({low:.3f} … {high:.3f})"
     )
 
@@ -352,19 +352,20 @@ def _support_lines(derived: Derived, *, torsion_declared: bool) -> Iterator[str]
 
     def at_ends(likely: AtEnds) -> str:
         at_start, at_end = 100.0 * likely.start, 100.0 * likely.end
-        return f"{at_start:.0f} % at the start, {at_end:.0f} % at the end (50 %: not determined)"
+        return f"{at_start:.0f} % at the start, {at_end:.0f} % at the end (50 % if not determined)"
 
     if derived.probability_sprung is not None:
         yield f"probability of rotational restraint: {at_ends(derived.probability_sprung)}"
     if derived.probability_giving is not None:
         yield f"probability of bearing compliance: {at_ends(derived.probability_giving)}"
     if torsion_declared:
-        yield "the deck twists under the truck: declared, the lane is off the axis"
+        yield "torsion of the deck: declared (the lane is off the axis)"
     elif derived.probability_torsion:
         likely = f"{100.0 * derived.probability_torsion:.0f} %"
-        yield f"probability that the deck twists under the truck: {likely} (50 %: not determined)"
+        yield f"probability that the deck twists: {likely} (50 % if not determined)"
     if derived.springs_believed is not None:
-        yield f"weight of the body equations: {100.0 * derived.springs_believed:.0f} %"
+        weight = f"{100.0 * derived.springs_believed:.0f} %"
+        yield f"weight of the body equations: {weight} (low with suspension friction)"
 
 
 def _level_lines(crossing: CrossingResult, *, is_stated: bool) -> Iterator[str]:
@@ -380,7 +381,7 @@ def _level_lines(crossing: CrossingResult, *, is_stated: bool) -> Iterator[str]:
             + (
                 ""
                 if mismatch.bridge_ratio is None
-                else f"; on the bridge × {mismatch.bridge_ratio:.1f}"
+                else f"; × {mismatch.bridge_ratio:.1f} on the bridge"
             )
         )
 
@@ -391,7 +392,7 @@ def _fit_lines(crossing: CrossingResult, *, is_level_stated: bool = False) -> It
     if crossing.scale_error is not None:
         yield (
             f"common scale uncertainty: {100.0 * crossing.scale_error:.1f} % "
-            "(standard deviation; mass, gain)"
+            "(standard deviation, from mass and gain)"
         )
     if crossing.chi2_per_dof is not None:
         yield f"reduced chi-square: {crossing.chi2_per_dof:.2f} (expected 1)"
@@ -405,7 +406,7 @@ def _fit_lines(crossing: CrossingResult, *, is_level_stated: bool = False) -> It
     if "relative_misfit" in diagnostics:
         yield (
             f"front and rear road profiles differ by {diagnostics['residual_rms_m'] * 1e6:.2f} µm "
-            f"rms, {100.0 * diagnostics['relative_misfit']:.2g} % of the profile"
+            f"(RMS), {100.0 * diagnostics['relative_misfit']:.2g} % of the profile"
         )
     if "seconds" in diagnostics:
         yield f"computed in {diagnostics['seconds']:.1f} s"

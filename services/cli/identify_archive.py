@@ -116,7 +116,7 @@ def _check(options: IdentifyOptions, into: Path) -> None:
     for name, path in single.items():
         if path is not None:
             raise InputError(
-                f"--{name}: cannot be combined with --into; identify single recordings without it"
+                f"--{name}: cannot be combined with --into; leave --into out for single recordings"
             )
     check_validations(options.validations)
     for source in options.recordings:
@@ -138,7 +138,7 @@ def _site_of(sources: Sequence[Source], site: Path | None) -> Site:
             continue
         if text is not None:
             return parse_site(text, f"{recording}: site.toml")
-    raise InputError(f"{sources[0]}: no recording has a site file in it, give one with --site")
+    raise InputError(f"{sources[0]}: no recording contains a site file; give one with --site")
 
 
 def _all_of(source: Source) -> Iterator[Recording]:

@@ -275,7 +275,8 @@ class RealmModel:
             return None
         self.bridges[bridge] = row
         return (
-            f"{bridge} by {count_of(used, 'crossing')}: {row.finding or row.lowest or row.verdict}"
+            f"{bridge}, {count_of(used, 'crossing')} fused: "
+            f"{row.finding or row.lowest or row.verdict}"
         )
 
     def _take_alarm(self, alarm: Alarm) -> str | None:
@@ -285,7 +286,7 @@ class RealmModel:
         if before is None and len(self.alarms) >= _MAX_BRIDGES:
             self.alarms.pop(min(self.alarms, key=lambda name: _weight(self.alarms[name])))
         self.alarms[alarm.bridge] = alarm
-        return f"alarm of {alarm.bridge}: {alarm.sentence()}: {alarm_state(alarm)}"
+        return f"alarm of {alarm.bridge}, {alarm_state(alarm)}: {alarm.sentence()}"
 
     def _note_boot(self, service: str, boot_id: int) -> None:
         """Forget the work of a service's process that another one has replaced."""
@@ -361,7 +362,7 @@ def service_figures(service: ServiceRow, age_s: float | None = None) -> str:
     number = round(known.get("identifying", 0.0))
     if age_s is not None and number:
         longest_s = known.get("identifying_longest_s", 0.0) + max(age_s, 0.0)
-        several = f" {number}, the first" if number > 1 else ""
+        several = f" {number} crossings, the longest" if number > 1 else ""
         parts.append(f"identifying{several} for {longest_s:.0f} s")
     if "rate_per_s" in known:
         parts.append(f"{known['rate_per_s']:.0f} messages/s")

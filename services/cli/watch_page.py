@@ -22,6 +22,7 @@ from services.cli.realm_model import (
     service_figures,
 )
 from services.common.crossing_states import ON_BRIDGE
+from services.common.naming import count_of
 
 _BLOCKS: Final = "▁▂▃▄▅▆▇█"
 _STEP: Final = 0.2
@@ -47,7 +48,7 @@ _MAX_BRIDGES: Final = 4
 _LINES_OF_BRIDGE: Final = 4
 """Usual lines of a bridge: its finding is two or three sentences."""
 NO_ALARM: Final = (
-    "No alarm was received; it is not known here whether driveby alarm serve watches any bridge."
+    "No alarm was received; it is not known here whether driveby alarm serve monitors any bridge."
 )
 _WAITS: Final = "waits for samples"
 """State of a crossing whose truck sends nothing before the crossing is decided."""
@@ -106,12 +107,14 @@ def page(
         parts.append(_trucks(trucks[:most_trucks], listening, now_s))
         parts += _wrong_time_notes(trucks, listening.realm)
         if len(trucks) > most_trucks:
-            parts.append(Text(f"  and {len(trucks) - most_trucks} more", style="dim"))
+            more = count_of(len(trucks) - most_trucks, "more truck")
+            parts.append(Text(f"  and {more}", style="dim"))
     if rows:
         shown = rows[: max(3, room - most_trucks)]
         parts.append(_crossings(shown, _held(model, now_s), is_wide=is_wide))
         if len(rows) > len(shown):
-            parts.append(Text(f"  and {len(rows) - len(shown)} earlier", style="dim"))
+            more = count_of(len(rows) - len(shown), "earlier crossing")
+            parts.append(Text(f"  and {more}", style="dim"))
     if model.bridges and not alarms:
         parts.append(Text(NO_ALARM, style="dim", no_wrap=True, overflow="ellipsis"))
     if model.bridges:
@@ -232,9 +235,9 @@ def _wrong_time_notes(trucks: Sequence[tuple[str, TruckRow]], realm: str) -> lis
         (old, f"{why}wrong"),
         (
             behind,
-            "all samples are equally old: the clock of the truck is behind, or this one's ahead",
+            "all samples are equally old: the truck's clock is behind, or this machine's is ahead",
         ),
-        (ahead, "samples are from the future: the clock of the truck or of this machine is wrong"),
+        (ahead, "samples are dated ahead: the clock of the truck or of this machine is wrong"),
     ]
     return [
         Text(
@@ -261,7 +264,7 @@ def _held(model: RealmModel, now_s: float) -> frozenset[str]:
 
 
 def _crossings(rows: Sequence[CrossingRow], held: Set[str], *, is_wide: bool) -> Table:
-    names = ("entry", "crossing", "", "EI", "lowest, of nominal (95 %)")
+    names = ("entry", "crossing", "", "EI", "lowest EI/nominal (95 %)")
     table = _table(*names, *(["why"] if is_wide else []))
     for row in rows:
         words = _WAITS if row.crossing_id in held else row.state
@@ -312,7 +315,7 @@ def _alarms(alarms: Iterable[Alarm], most: int) -> list[Text]:
     known = sorted(alarms, key=lambda one: (one.acknowledged is not None, -one.raised, one.bridge))
     lines = [
         Text(
-            f"alarm of {one.bridge}: {alarm_state(one)}; {one.sentence()}",
+            f"alarm of {one.bridge}, {alarm_state(one)}: {one.sentence()}",
             style="bold red" if one.acknowledged is None else "dim",
             no_wrap=True,
             overflow="ellipsis",
@@ -321,7 +324,7 @@ def _alarms(alarms: Iterable[Alarm], most: int) -> list[Text]:
     ]
     if len(known) > most:
         standing = sum(one.acknowledged is None for one in known[most:])
-        more = f"  and {len(known) - most} more alarms, {standing} of them active"
+        more = f"  and {count_of(len(known) - most, 'more alarm')}, {standing} active"
         lines.append(Text(more, style="red" if standing else "dim"))
     return lines
 

@@ -22,7 +22,7 @@ def one_line(crossing: CrossingResult, bridge: Bridge) -> str:
         parts.append(f"({', '.join(crossing.reasons)})")
     elements = [ratio for _, _, ratio in _elements(crossing, bridge)]
     if elements:
-        parts.append(f"EI of nominal {' '.join(f'{ratio:.3f}' for ratio in elements)}")
+        parts.append(f"EI / nominal {' '.join(f'{ratio:.3f}' for ratio in elements)}")
     return " ".join(parts)
 
 

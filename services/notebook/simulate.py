@@ -79,7 +79,7 @@ class Simulation(NamedTuple):
         seconds = float(run.accel_time_s[-1] - run.accel_time_s[0])
         return (
             f"<Simulation {vehicle} over {bridge}: {seconds:.1f} s at {run.rate_hz:g} Hz, "
-            f"EI of nominal {ratios}>"
+            f"EI / nominal {ratios}>"
         )
 
     @property

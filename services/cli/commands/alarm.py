@@ -30,8 +30,8 @@ _MAX_LINES = 20
 """Maximum number of listed bridges without monitoring."""
 _HOW = (
     "an alarm compares periods; identify and fuse combine all crossings, which hides a change\n"
-    "see it: driveby history BRIDGE --period {period} --figures DIR; inspect the bridge, then "
-    "acknowledge the alarm: driveby alarm ack BRIDGE --by NAME --note TEXT"
+    "draw it with driveby history BRIDGE --period {period} --figures DIR, inspect the bridge, then "
+    "acknowledge the alarm with driveby alarm ack BRIDGE --by NAME --note TEXT"
 )
 
 
@@ -167,7 +167,7 @@ def _print_watches(folder: Path) -> None:
     for realm, bridge in list(others)[:_MAX_LINES]:
         print(f"{bridge} in realm {realm}: {others[(realm, bridge)].sentence}")
     if len(others) > _MAX_LINES:
-        print(f"and {len(others) - _MAX_LINES} more that are not monitored")
+        print(f"and {count_of(len(others) - _MAX_LINES, 'more bridge')} not monitored")
 
 
 def _how_many_monitored(monitored: int, bridges: int) -> str:

@@ -130,10 +130,12 @@ def _print_crossings(found: "CatalogScan") -> None:
             f"{' '.join(one.recordings)}"
         )
     if len(found.crossings) > _MAX_LINES:
-        print(f"… and {len(found.crossings) - _MAX_LINES} more (--csv has all)")
+        print(
+            f"… and {count_of(len(found.crossings) - _MAX_LINES, 'more crossing')} (--csv has all)"
+        )
     print(
-        f"{count_of(len(found.crossings), 'crossing')}; read {found.chunks_read} of "
-        f"{found.chunks} chunks of {count_of(found.files_read, 'recording')}"
+        f"{count_of(len(found.crossings), 'crossing')}; {found.chunks_read} of {found.chunks} "
+        f"chunks read from {count_of(found.files_read, 'recording')}"
     )
 
 

@@ -75,7 +75,7 @@ def _history(options: HistoryOptions) -> int:
     if words[:1] == (_ADD,) and len(words) > 1:
         return _add(options, [Path(word) for word in words[1:]])
     if options.temperature is not None:
-        raise InputError("--temperature: is for driveby history add RESULTS")
+        raise InputError("--temperature: has no effect without add RESULTS")
     if len(words) > 1:
         raise InputError(f"history: one bridge is expected, or {_ADD} RESULTS …")
     return _show(options, words[0]) if words else _table(options)
@@ -114,7 +114,7 @@ def _results_of(path: Path, problem: Callable[[str], object]) -> "Iterable[Resul
     if files_of_workers(path):
         return results_of_workers(path, problem)
     raise InputError(
-        f"{path}: has no results, HASH.parquet of driveby identify --into or results-TIME.json of "
+        f"{path}: has no results; HASH.parquet of driveby identify --into or results-TIME.json of "
         "driveby worker (in FOLDER/REALM) are expected"
     )
 
@@ -249,7 +249,7 @@ def _lines(past: "BridgeHistory") -> Iterator[str]:
         used = 0 if one.state is None else len(one.state.crossings_used)
         head = f"{utc_day(one.begin_s)}  {used:>3} of {one.crossings:<3} {warm}"
         if one.state is None or not one.state.elements:
-            yield f"{head}  none of them could be used"
+            yield f"{head}  no crossing could be used"
             continue
         cells = "".join(
             f"{e.mean / 1e9:7.2f} ± {(e.q975 - e.q025) / 2e9:<5.2f}"

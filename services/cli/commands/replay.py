@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Final
 
 from services.cli.parser import Subcommand
 from services.common.errors import InputError
+from services.common.naming import count_of
 from services.replay.settings import ReplaySettings
 
 if TYPE_CHECKING:
@@ -43,13 +44,13 @@ def summary(found: "ReplayStatistics") -> list[str]:
             else f", {factor:.2g} times real speed"
         )
     lines = [
-        f"{found.messages} messages published in realm {found.realm}: {streams}",
+        f"{count_of(found.messages, 'message')} published in realm {found.realm}: {streams}",
         f"{found.drive_s:.1f} s of the drive in {found.took_s:.2f} s{rounds}{pace}",
     ]
     if found.trucks:
         lines.append(f"trucks: {', '.join(found.trucks)}")
     if found.jumped_over:
-        lines.append(f"{found.jumped_over} messages left out by jumps")
+        lines.append(f"{count_of(found.jumped_over, 'message')} left out by jumps")
     if found.skipped_s:
         lines.append(f"{found.skipped_s:.1f} s of silence skipped")
     on_disk = "a logger has them on disk" if found.is_confirmed else "no logger confirmed them"

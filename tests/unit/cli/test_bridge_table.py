@@ -58,7 +58,7 @@ def test_wander_of_few_runs_is_poorly_known(runs: int, groups: int, is_known: bo
     assert "lateral wander 0.12 m" in text
     assert ("poorly known from about" in text) != is_known
     if runs == 4:
-        assert "0.12 m (poorly known from about 2 runs, partly a usual value)" in text
+        assert "0.12 m (poorly known from about 2 runs, so partly a typical value)" in text
 
 
 def test_runs_of_each_wheel_path_group_are_counted() -> None:
@@ -71,10 +71,10 @@ def test_runs_of_each_wheel_path_group_are_counted() -> None:
         )
     ]
     text = printed(5, 2, crossings=crossings)
-    assert "start to end, lateral wander 0.12 m (poorly known from 3 runs, partly" in text
-    assert "end to start, lateral wander 0.12 m (poorly known from 2 runs, partly" in text
+    assert "start to end, lateral wander 0.12 m (poorly known from 3 runs, so partly" in text
+    assert "end to start, lateral wander 0.12 m (poorly known from 2 runs, so partly" in text
     alone = printed(4, 1, crossings=crossings)  # the other direction was driven once
-    assert "start to end, lateral wander 0.12 m (poorly known from 3 runs, partly" in alone
+    assert "start to end, lateral wander 0.12 m (poorly known from 3 runs, so partly" in alone
     every = [one.model_copy(update={"direction": WAYS[0]}) for one in crossings]
     assert "poorly known" not in printed(5, 1, crossings=every)
 

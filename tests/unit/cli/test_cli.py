@@ -87,7 +87,7 @@ def test_import_writes_a_recording_with_its_site(
     before = output.read_bytes()
     pair = (drive / "accel_00.csv", drive / "gps_00.csv")
     again = ("import", *pair, "--site", drive / "site.toml", "-o", output)
-    assert "without --force" in refused(capsys, *again)
+    assert "only with --force" in refused(capsys, *again)
     assert run(capsys, *again, "--force")[0] == 0
     assert output.read_bytes() == before  # replaced by the same
 
@@ -209,7 +209,7 @@ def test_unusual_site_file_is_warned_of_and_used(
     arguments = ("import", drive, "--site", site, "-o", output)
     code, _, err = run(capsys, *arguments)
     assert code == 0
-    assert f"{site}: truck-x: noise 0.025 µg/√Hz: typical is" in err
+    assert f"{site}: truck-x: noise 0.025 µg/√Hz; typical is" in err
     assert "in mg/√Hz? then it is 25" in err
     code, out, _ = run(capsys, "check", site)
     assert code == 1
@@ -236,7 +236,9 @@ def test_import_previews_writes_a_map_and_reads_by_it(
     assert "--preview" in line
     code, shown, _ = run(capsys, *arguments, "--preview")
     assert (code, listing(drive.parent)) == (0, before)
-    assert 'guess: accel_00.csv: by their names sprung_front is column "Body front [m/s2]"' in shown
+    assert (
+        'guess: accel_00.csv: by their names: sprung_front is column "Body front [m/s2]"' in shown
+    )
     drawn = drive.parent / "as-read.png"
     assert run(capsys, *arguments, "--preview", "--picture", drawn)[0] == 0
     assert drawn.read_bytes().startswith(b"\x89PNG")
@@ -368,7 +370,7 @@ def test_recordings_that_cannot_be_identified(
     [
         ([], "the following arguments are required: COMMAND"),
         (["fly"], "invalid choice: 'fly'"),
-        (["simulate", "-o", "x"], "one of the arguments --scenario --ei is required"),
+        (["simulate", "-o", "x"], "--scenario or --ei is required"),
         (["simulate", "--scenario", "13", "-o", "x"], '--scenario: is "13", it must be 1 to 12'),
         (["simulate", "--scenario", "6"], "required: -o/--output"),
         (["simulate", "--scenario", "6", "--ei", "1,1", "-o", "x"], "not allowed with argument"),
@@ -399,7 +401,7 @@ def test_recordings_that_cannot_be_identified(
             '--bearing-stiffness: is "3", it must be vertical stiffnesses in N/m (START:END) from',
         ),
         (["validate", "--effects", "swing,wind"], "must be all or some of free, sprung"),
-        (["simulate", "--scen", "6", "-o", "x"], "one of the arguments --scenario --ei"),
+        (["simulate", "--scen", "6", "-o", "x"], "--scenario or --ei is required"),
         (["validate", "--scenarios", "1,0"], '--scenarios: is "0", it must be 1 to 12'),
         (["replay"], "required: REC.mcap"),
         (["replay", "x", "--speed", "-2"], '--speed: is "-2", it must be a factor from 0'),
@@ -422,7 +424,7 @@ def test_only_a_surface_has_axles_beside_one_another(
 ) -> None:
     output = tmp_path / "x.mcap"
     line = refused(capsys, "simulate", "--scenario", "6", *option, "-o", output)
-    assert line == f"{option[0]}: only a --road-surface has it"
+    assert line == f"{option[0]}: has no effect without --road-surface"
     assert not output.exists()
 
 
@@ -606,7 +608,7 @@ def test_no_command_replaces_a_recording_by_accident_or_while_it_is_written(
     living.finish("done")
     content = target.read_bytes()
     assert cli.main([command, *arguments, str(target)]) == 2
-    assert "is a recording, and none is replaced without --force" in capsys.readouterr().err
+    assert "is a recording, which is replaced only with --force" in capsys.readouterr().err
     assert target.read_bytes() == content
     assert list(tmp_path.iterdir()) == [target]
     if command != "identify":

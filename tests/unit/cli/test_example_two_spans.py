@@ -28,7 +28,7 @@ def test_survey_of_two_spans_finds_and_reports_the_weak_element(
         assert program == ".venv/bin/driveby"
         assert cli.main(arguments) == 0, line
     fused = capsys.readouterr().out
-    assert "Element 3, 13.3 to 20.0 m" in fused
+    assert "Element 3 (13.3 to 20.0 m)" in fused
     found = load_results(tmp_path / "survey.json")
     assert [crossing.verdict for crossing in found.crossings] == ["good", "good"]
     state = found.bridges["mill-brook"]
@@ -37,4 +37,4 @@ def test_survey_of_two_spans_finds_and_reports_the_weak_element(
     assert ratios[3].q025 < 0.6 * 6.0e9 < ratios[3].q975
     assert ratios[3].q975 < min(one.q025 for n, one in ratios.items() if n != 3)
     report = (tmp_path / "survey.html").read_text()
-    assert "Element 3, 13.3 to 20.0 m" in report
+    assert "Element 3 (13.3 to 20.0 m)" in report

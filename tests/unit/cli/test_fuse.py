@@ -25,8 +25,8 @@ def test_duplicate_results_count_once_and_are_reported(
     other = write(tmp_path / "other.json", [crossing(n) for n in range(1, 4)])
     assert main(["fuse", str(one), str(other)]) == 0
     out = " ".join(capsys.readouterr().out.split())
-    assert "2 results of crossings that another file has too: the newest counts" in out
-    assert "bridge-1, 4 crossings together" in out
+    assert "2 results of crossings that are also in another file; the newest" in out
+    assert "bridge-1, 4 crossings fused" in out
     assert main(["fuse", str(one)]) == 0
     assert "another file" not in capsys.readouterr().out
 
@@ -66,7 +66,7 @@ def test_element_weak_in_the_baseline_is_named(
     second = write(tmp_path / "second.json", [crossing(n) for n in range(2, 4)])
     capsys.readouterr()
     assert main(["fuse", str(second), "--baseline", str(before), "--json", str(now)]) == 0
-    words = "was clearly less stiff than the others in the baseline already."
+    words = "was already clearly less stiff than the others in the baseline."
     assert words in " ".join(capsys.readouterr().out.split())
     finding = load_results(now).bridges["bridge-1"].finding
     assert finding is not None
@@ -85,7 +85,9 @@ def test_simulated_baseline_of_measured_crossings_is_named(
     site = tmp_path / "site.toml"
     site.write_text(site_toml(paper_site().model_copy(update={"bridges": (bridge,)})))
     given = [by, str(before if by == "--baseline" else site)]
-    caution = "bridge-1: The baseline was simulated, these crossings were measured: a difference "
+    caution = (
+        "bridge-1: The baseline was simulated and these crossings were measured, so a difference "
+    )
     for realm, is_named in (("import-drives", True), ("sim-y", False)):
         capsys.readouterr()
         later = [crossing(n).model_copy(update={"realm": realm}) for n in range(2, 4)]
@@ -161,13 +163,16 @@ def test_combined_days_name_the_commands_that_show_a_change(
         path = write(tmp_path / "r.json", some)
         assert main(["fuse", str(path)]) == 0
         out = " ".join(capsys.readouterr().out.split())
-        assert ("whether EI changed between them: driveby history" in out) is is_printed
+        assert ("driveby history and driveby alarm check show whether" in out) is is_printed
 
 
 @pytest.mark.parametrize(
     ("numbers", "line"),
     [
-        ((0, 1), "bridge-1: The baseline has the same crossings: a measurement is compared with"),
+        (
+            (0, 1),
+            "bridge-1: The baseline consists of the same crossings: the measurement is",
+        ),
         ((1, 2), "bridge-1: One of these crossings is in the baseline, too: a change is under"),
         ((2, 3), None),
     ],
@@ -200,10 +205,10 @@ def test_fused_intervals_without_a_passed_site_validation_have_one_line(
     path = write(tmp_path / "r.json", [crossing(n) for n in range(2)])
     asked = ["fuse", str(path)]
     assert main(asked) == 0
-    line = "truck-1 on bridge-1: the results name no passed site validation; with --site SITE.toml"
+    line = "truck-1 on bridge-1: the results name no passed site validation; give --site SITE.toml"
     assert capsys.readouterr().out.count(line) == 1
     asked += ["--site", str(toml), "--validations", str(tmp_path)]
-    for words in ("No site validation of", "Site validation of"):
+    for words in (f"The folder {tmp_path.name} has no site validation of", "Site validation of"):
         assert main(asked) == 0
         assert capsys.readouterr().out.count(f"bridge-1: {words} truck-1 on this bridge") == 1
         save(tmp_path, certificate(site, passed=False))

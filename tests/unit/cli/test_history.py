@@ -127,7 +127,7 @@ def test_a_folder_without_results_is_one_line(
     assert add(tmp_path, tmp_path) == 2
     output = capsys.readouterr().err
     assert output.count("\n") == 1
-    assert f"{tmp_path}: has no results, HASH.parquet of driveby identify --into" in output
+    assert f"{tmp_path}: has no results; HASH.parquet of driveby identify --into" in output
     assert "results-TIME.json of driveby worker (in FOLDER/REALM) are expected" in output
     assert not (tmp_path / "history").exists()
 

@@ -46,7 +46,7 @@ def test_identify_prints_nothing_else(project: Path, tmp_path: Path) -> None:
     done = run(project, *arguments)
     assert done.returncode == 0
     (line,) = done.stderr.splitlines()  # of the site file, and nothing of the overflow
-    assert f"{site}: truck-1: noise 1e+06 µg/√Hz: typical is" in line
+    assert f"{site}: truck-1: noise 1e+06 µg/√Hz; typical is" in line
     [crossing] = load_results(out).crossings
     assert crossing.verdict == "rejected"
     assert Reason.FAILED not in crossing.reasons

@@ -186,7 +186,7 @@ def test_lines_for_a_pipe(site: Site) -> None:
         "truck-1 → bridge-1, entry 2026-09-21 14:23:10: identifying",
         (
             "truck-1 → bridge-1, entry 2026-09-21 14:13:20: "
-            "good, lowest EI_4 0.400 of nominal (95 %: 0.377 to 0.424)"
+            "good, lowest EI_4 0.400 of nominal (95 % interval 0.377 to 0.424)"
         ),
         "logger is NOT WELL: 3 messages/s, disk full",
     ]
@@ -218,7 +218,7 @@ def test_samples_from_the_future_are_explained() -> None:
     lines = drawn(watched)
     assert line(lines, "truck-1").endswith("60 min ahead")
     assert any(
-        "truck-1: samples are from the future: the clock of the truck or of this machine is wrong"
+        "truck-1: samples are dated ahead: the clock of the truck or of this machine is wrong"
         in one
         for one in lines
     )
@@ -230,7 +230,7 @@ def test_an_empty_realm_names_the_others() -> None:
     assert any("No trucks yet." in one for one in drawn(RealmModel(), listened=listened))
     listened.elsewhere = {"sim-demo": {"truck-1"}}
     lines = drawn(RealmModel(), listened=listened)
-    assert "nothing in realm live, but truck-1 in sim-demo: --realm sim-demo" in lines
+    assert "nothing in realm live, but truck-1 in sim-demo; use --realm sim-demo" in lines
 
 
 def test_a_service_that_is_silent_or_unwell_stands_out() -> None:
@@ -265,7 +265,10 @@ def test_absent_worker_is_named_in_place_of_no_waiting(site: Site) -> None:
 def test_time_of_an_identification_goes_on_between_messages() -> None:
     """Its health comes once a minute."""
     watched = RealmModel()
-    for number, expected in ((1.0, "identifying for"), (3.0, "identifying 3, the first for")):
+    for number, expected in (
+        (1.0, "identifying for"),
+        (3.0, "identifying 3 crossings, the longest for"),
+    ):
         deliver(watched, health("worker", identifying=number, identifying_longest_s=8.0))
         row = watched.services["worker"]
         for age_s in (0.0, 40.0, -1.0):
@@ -400,9 +403,9 @@ def test_an_alarm_is_a_line_until_it_is_another(site: Site) -> None:
         deliver(watched, one) for one in (alarm(), alarm(), alarm(by="owner"), alarm(by="owner"))
     ]
     assert output == [
-        f"alarm of bridge-1: {SENTENCE}: active",
+        f"alarm of bridge-1, active: {SENTENCE}",
         None,
-        f"alarm of bridge-1: {SENTENCE}: acknowledged by owner",
+        f"alarm of bridge-1, acknowledged by owner: {SENTENCE}",
         None,
     ]
 
@@ -413,12 +416,12 @@ def test_alarms_that_stand_come_first_on_the_page(site: Site) -> None:
         deliver(watched, alarm(f"old-{number}", by="owner", raised=1.7899e9 + number))
     deliver(watched, alarm())
     lines = drawn(watched)
-    assert lines[1] == f"alarm of bridge-1: active; {SENTENCE}"
-    assert lines[2] == f"alarm of old-4: acknowledged by owner; {SENTENCE}"
-    assert "  and 2 more alarms, 0 of them active" in lines
+    assert lines[1] == f"alarm of bridge-1, active: {SENTENCE}"
+    assert lines[2] == f"alarm of old-4, acknowledged by owner: {SENTENCE}"
+    assert "  and 2 more alarms, 0 active" in lines
     for number in range(5):
         deliver(watched, alarm(f"new-{number}"))
-    assert "  and 7 more alarms, 2 of them active" in drawn(watched)
+    assert "  and 7 more alarms, 2 active" in drawn(watched)
     assert len(drawn(watched, 80, 24)) <= 26
 
 
@@ -455,7 +458,7 @@ def test_bad_options_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_absent_alarms_are_no_reassurance_on_the_page(site: Site) -> None:
     """The page cannot know whether bridges are watched, and says so until an alarm comes."""
-    output = "No alarm was received; it is not known here whether driveby alarm serve watches"
+    output = "No alarm was received; it is not known here whether driveby alarm serve monitors"
     watched = RealmModel()
     assert not any(one.startswith(output) for one in drawn(watched))
     deliver(watched, bridge_state(site))
@@ -470,9 +473,11 @@ def test_clock_that_is_behind_is_explained() -> None:
     drives(watched, "truck-2", lag_s=1.0)
     drives(watched, "truck-3", lag_s=30.0)
     watched.trucks["truck-3"].lags_s.extend([9.0] * 50)  # it catches up
-    output = "truck-1 by 9.0 s: all samples are equally old: the clock of the truck is behind"
+    output = "truck-1 by 9.0 s: all samples are equally old: the truck's clock is behind"
     lines = [one.strip() for one in drawn(watched)]
-    assert [one for one in lines if "equally old" in one] == [f"{output}, or this one's ahead"]
+    assert [one for one in lines if "equally old" in one] == [
+        f"{output}, or this machine's is ahead"
+    ]
     replayed = drawn(watched, listened=Listened("replay-monday"))
     assert not any("equally old" in one for one in replayed)
 
@@ -505,7 +510,7 @@ def test_bridge_without_a_good_crossing_has_its_reason(site: Site) -> None:
     payload = bridge_to_protobuf("bridge-1", NOW_NS, rejected).SerializeToString()
     words = "No crossing of the bridge is good."
     printed = deliver(watched, heard("bridge", "bridge-1", "state", payload))
-    assert printed == f"bridge-1 by 0 crossings: {words}"
+    assert printed == f"bridge-1, 0 crossings fused: {words}"
     assert line(drawn(watched), "bridge-1").endswith(f"rejected: {words}")
 
 

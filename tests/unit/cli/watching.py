@@ -98,9 +98,9 @@ def estimate(crossing: CrossingResult) -> BusMessage:
 
 
 WEAK_FINDING = (
-    "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements "
-    "(95 % interval 57 to 62 %). No other element differs clearly (estimates within 3 %). "
-    "A loss of 16 % in any of them is detected with 95 % probability."
+    "Element 4 (12.9 to 17.1 m) is 60 % less stiff than the other elements "
+    "(95 % interval 57 to 62 %). No other element differs clearly (estimated at most "
+    "3 %). A loss of 16 % in any of these elements is detected with 95 % probability."
 )
 
 
@@ -189,8 +189,8 @@ def a_fleet(site: Site) -> RealmModel:
     drives(watched, "truck-3", ago_s=300.0)
     rng = np.random.default_rng(4)
     quiet = (
-        "No element differs clearly from the others (estimates within {} %). "
-        "A loss of 14 % in any of them is detected with 95 % probability."
+        "No element differs clearly from the others (estimated at most {} %). "
+        "A loss of 14 % in any of these elements is detected with 95 % probability."
     )
     for number, bridge in enumerate(("bridge-02", "bridge-03", "bridge-11", "bridge-07")):
         ratios = 1.0 + 0.012 * rng.standard_normal(7)
@@ -199,9 +199,10 @@ def a_fleet(site: Site) -> RealmModel:
         finding = quiet.format(2 + number)
         if is_weak:
             finding = (
-                "Element 4, 12.9 to 17.1 m: 20 % less stiff than the other elements "
-                "(95 % interval 16 to 24 %). No other element differs clearly (estimates within "
-                "3 %). A loss of 14 % in any of them is detected with 95 % probability."
+                "Element 4 (12.9 to 17.1 m) is 20 % less stiff than the other elements "
+                "(95 % interval 16 to 24 %). No other element differs clearly (estimated at "
+                "most 3 %). A loss of 14 % in any of these elements is detected "
+                "with 95 % probability."
             )
         of = {"bridge": bridge, "ratios": ratios}
         who = f"truck-{number % 3 + 1}"
