@@ -90,7 +90,7 @@ def test_what_was_in_a_file_that_is_gone_is_not_called_durable(
         ours.append(moved)
     else:
         assert published.messages == 100
-        assert "100 messages are gone, 100 of them were confirmed as durable" in published.text
+        assert "100 messages lost, 100 of them confirmed as durable" in published.text
         assert found.count == 50
         assert not found.HasField("sequence")
         [gone] = writer.withdrawn

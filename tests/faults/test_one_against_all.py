@@ -46,7 +46,7 @@ def test_files_of_one_vehicle_in_many_realms_leave_room_for_the_others(tmp_path:
     dropped = 3 * (300 - MAX_FILES_OF_ONE)
     assert writer.dropped == dropped
     [drop] = writer.drops()
-    why = "had no file: 4 of this vehicle are open, in as many realms"
+    why = "had no file: 4 files of this vehicle are open, one for each realm"
     assert drop[1:] == ("truck-evil", why, dropped)
     unwritten = {name: numbers.size for one in writer.unwritten for name, numbers in one.items()}
     assert len(unwritten) == 300 - MAX_FILES_OF_ONE
@@ -60,7 +60,7 @@ def test_too_many_vehicles_are_reported(tmp_path: Path, monkeypatch: pytest.Monk
     for number in range(6):
         writer.put(fix(f"truck-{number}", "live", 0))
     writer.finish("done", {})
-    why = "had no file: 5 of all vehicles are open"
+    why = "had no file: 5 files of all vehicles are open"
     assert writer.drops() == [Drop("live", "truck-5", why, 1)]
 
 

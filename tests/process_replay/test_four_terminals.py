@@ -69,7 +69,7 @@ def test_what_the_readme_says_happens(endpoint: str, project: Path, tmp_path: Pa
             if name in ("logger", "worker"):
                 until(partial(is_ready, name), f"the {name}")
         assert started["truck"].wait(timeout=LONGEST_S) == 0, seen("truck")
-        lowest = r"good, lowest EI_4 0\.4\d\d of nominal \(95 %: 0\.3\d\d to 0\.4\d\d\)\n"
+        lowest = r"good, lowest EI_4 0\.4\d\d of nominal \(95 % interval 0\.3\d\d to 0\.4\d\d\)\n"
         shown = rf"truck-1 → bridge-1, entry [\d: -]+: {lowest}"
         until(lambda: re.search(shown, seen("watch")), "the result")
         for state in ("truck-1 drives", "on the bridge", "complete", "identifying"):
@@ -109,6 +109,6 @@ def test_a_worker_in_the_wrong_realm_says_so(
             output = worker.stderr.readline()
             assert output, "it has ended"
         assert output.endswith(
-            "nothing in realm sim-one, but truck-1 in sim-two: --realm sim-two\n"
+            "nothing in realm sim-one, but truck-1 in sim-two; use --realm sim-two\n"
         )
         publisher.close()

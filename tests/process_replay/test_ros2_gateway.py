@@ -264,9 +264,9 @@ def test_what_is_not_known_is_refused_by_name_and_hash_and_nothing_ends_it(
     assert f"{front}: is of x\\x1b[2J y, {IMU.name} is expected; refused\n" in log
     assert "240 messages of a second sensor, left out" in log
     assert "3 messages left out (the first has no attachment" in log
-    assert "1 messages larger than any of a sensor, left out" in log
+    assert "1 message too large for a sensor, left out" in log
     assert f"{front}: 3 messages of another type, left out (the first {IMU.name} has the" in log
-    assert "1 stamps too far from when they were sent (the first by 3600.000 s)" in log
+    assert "1 stamp too far from the time of sending (the first by 3600.000 s)" in log
     assert "Traceback" not in log
     samples = one_run(tmp_path / "live.mcap").channels["sprung_front"]
     np.testing.assert_array_equal(samples.time_ns, stamps)

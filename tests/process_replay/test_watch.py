@@ -55,7 +55,7 @@ def test_lines_into_a_pipe(
         assert watch.stdout is not None
         wanted = (
             "truck-1 → bridge-1, entry 2026-09-21 14:13:20: "
-            "good, lowest EI_4 0.400 of nominal (95 %: 0.377 to 0.424)"
+            "good, lowest EI_4 0.400 of nominal (95 % interval 0.377 to 0.424)"
         )
         for output in watch.stdout:
             found = LINE.fullmatch(output)
@@ -103,7 +103,7 @@ def test_wrong_realm_is_reported(publisher: Publisher, endpoint: str) -> None:
         assert watch.stdout is not None
         found = LINE.fullmatch(watch.stdout.readline())
         assert found
-        assert found[1] == "nothing in realm sim-x, but truck-1 in live: --realm live"
+        assert found[1] == "nothing in realm sim-x, but truck-1 in live; use --realm live"
     finally:
         watch.kill()
         watch.communicate()

@@ -145,7 +145,7 @@ def test_a_crossing_waits_until_a_certificate_has_passed(
         assert line.endswith("; truck-1 on bridge-1 is not validated: it was so")
         log = stop(process)
         assert log.count("it was so") == 1
-        assert "1 crossings still wait for a site validation" in log
+        assert "1 crossing still waiting for a site validation" in log
 
         process = begin()
         notes.clear()
@@ -155,7 +155,7 @@ def test_a_crossing_waits_until_a_certificate_has_passed(
         save(folder, certificate(known, PAIR))
         until(lambda: heard.states() == WHOLE, "its result")
         log = stop(process)
-        assert "1 crossings waited for a site validation when an earlier run ended" in log
+        assert "1 crossing waited for a site validation when an earlier run ended" in log
     (estimate,) = heard.estimates()
     assert estimate.certificate == pair_hash(known, PAIR, SETTINGS)
     assert estimate.verdict == pb.GOOD

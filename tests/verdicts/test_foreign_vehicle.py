@@ -110,7 +110,7 @@ def test_the_bridge_is_what_the_sound_crossings_say(
     assert (state.verdict, len(state.crossings_used)) == ("good", 9)
     assert np.abs(z_scores(state)).max() < 4.0, z_scores(state)
     assert state.finding is not None
-    assert state.finding.startswith("Element 4, 12.9 to 17.1 m: ")
+    assert state.finding.startswith("Element 4 (12.9 to 17.1 m): ")
 
 
 def with_one(crossings: tuple[CrossingResult, ...], foreign: int) -> list[CrossingResult]:

@@ -20,7 +20,7 @@ def named(case: WideCase, *, is_doubted: bool) -> dict[Reason, str]:
 @pytest.mark.parametrize("number", [1, 2, 3, 9])
 def test_force_of_an_undeclared_axle_is_named(number: int) -> None:
     found = named(more_axles(number), is_doubted=False)
-    assert "% of its motion are unexplained" in found[Reason.MORE_AXLES_THAN_DECLARED]
+    assert "% of the rear's motion is unexplained" in found[Reason.MORE_AXLES_THAN_DECLARED]
 
 
 @pytest.mark.parametrize("number", [5, 15])
