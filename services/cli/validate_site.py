@@ -121,7 +121,7 @@ def line_of(certificate: ValidationRecord, path: Path, known: Site) -> str:
     """Return a validation record of a site's pair in one line."""
     figures = certificate.figures
     how = "passed" if certificate.passed else "FAILED"
-    fewer = (
+    after = (
         ""
         if figures.crossings == CROSSINGS
         else f" after {figures.crossings} of at most {CROSSINGS} crossings"
