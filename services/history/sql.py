@@ -29,12 +29,19 @@ class QueryResult(NamedTuple):
 
 _PARTITIONS: Final = "realm=*/bridge=*"
 _OVERVIEW = """
-SELECT realm, bridge, count(DISTINCT crossing_id) AS crossings,
-       count(DISTINCT crossing_id) FILTER (verdict = 'good') AS good,
+SELECT realm, bridge, count(*) AS crossings,
+       count(*) FILTER (verdict = 'good') AS good,
        count(DISTINCT vehicle) AS trucks,
        min(entry_s) AS first_s, max(entry_s) AS last_s
 FROM crossings WHERE entry_s BETWEEN 0 AND 2e11 GROUP BY realm, bridge ORDER BY realm, bridge
 """
+_NEWEST = """
+SELECT * FROM results QUALIFY row_number() OVER (
+    PARTITION BY realm, bridge, crossing_id
+    ORDER BY created_s DESC NULLS LAST, temperature_deg_c IS NOT NULL DESC, content DESC NULLS LAST
+) = 1
+"""
+"""Newest result of each crossing, by the rank that `read_partition` uses."""
 _EDITIONS: Final = """
 SELECT DISTINCT min(decode(value)) FILTER (decode(key) = $2)
 FROM parquet_kv_metadata($1) GROUP BY file_name
@@ -50,8 +57,9 @@ def overview(folder: Path) -> QueryResult:
 
 
 def query(folder: Path, question: str) -> QueryResult:
-    """Return the result of an SQL query on the table `crossings`.
+    """Return the result of an SQL query on the tables `crossings` and `results`.
 
+    `crossings` has the newest result of each crossing, `results` every stored one.
     Raise InputError if there is no history, or DuckDB rejects the query.
     """
     if not bridges_of(folder):
@@ -76,8 +84,9 @@ def _run_query(question: str, files: str | list[str], problems: tuple[str, ...])
             if [one.type for one in asked] != [duckdb.StatementType.SELECT]:
                 raise InputError("--sql: one query that begins with SELECT … is expected")
             _check_editions(connection, files)
-            crossings = connection.read_parquet(files, hive_partitioning=True, union_by_name=True)
-            crossings.create_view("crossings")
+            results = connection.read_parquet(files, hive_partitioning=True, union_by_name=True)
+            results.create_view("results")
+            connection.sql(_NEWEST).create_view("crossings")
             found = connection.sql(question)
             return QueryResult(tuple(found.columns), tuple(found.fetchall()), problems)
         except duckdb.Error as error:

@@ -67,7 +67,7 @@ class HistoryOptions:
     rrd: Path | None = output_option("Rerun file of EI over time", "OUT.rrd", RERUN)
     view: bool = flag("open EI over time in the Rerun viewer")
     web: bool = flag("open EI over time in the browser")
-    sql: str | None = opt("query of the table crossings (DuckDB)", metavar="SELECT …")
+    sql: str | None = opt("query of the tables crossings and results (DuckDB)", metavar="SELECT …")
 
 
 def _history(options: HistoryOptions) -> int:

@@ -106,6 +106,25 @@ def test_of_two_results_of_a_crossing_the_newer_one_counts(tmp_path: Path) -> No
     assert [one.chi2_per_dof for one in kept] == [1.5, 1.5]
 
 
+def test_sql_counts_each_crossing_once(tmp_path: Path) -> None:
+    """A later result or a later temperature replaces the row; `results` keeps all."""
+    some = crossings(2)
+    add_results(tmp_path, some)
+    add_results(tmp_path, some, {some.crossings[0].crossing_id: 12.0})
+    newer = some.crossings[1].model_copy(update={"chi2_per_dof": 1.5})
+    older = some.crossings[1].model_copy(update={"chi2_per_dof": 9.0})
+    for at_s, one in ((1.0, newer), (-1.0, older)):
+        update = {"created": some.created + at_s, "crossings": (one,)}
+        add_results(tmp_path, some.model_copy(update=update))
+    asked = "SELECT temperature_deg_c, chi2_per_dof FROM {} ORDER BY entry_s"
+    found = query(tmp_path, asked.format("crossings")).rows
+    kept = read_partition(where(tmp_path)).crossings
+    assert found == tuple((one.temperature_deg_c, one.chi2_per_dof) for one in kept)
+    assert (found[0][0], found[1][1]) == (12.0, 1.5)
+    assert len(query(tmp_path, asked.format("results")).rows) == 5
+    assert overview(tmp_path).rows[0][2:4] == (2, 2)
+
+
 def test_rejected_crossing_is_kept_and_adds_no_information(tmp_path: Path) -> None:
     some = crossings(1)
     rejected = CrossingResult.model_validate(
