@@ -17,6 +17,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
+from services.catalogue.deletions import CATALOG as CATALOG
+from services.catalogue.deletions import noted_deletions, remove_notes
 from services.catalogue.row import CatalogRow, StillOpenError, details_text, file_sha256, row_of
 from services.common.errors import FailureError, InputError
 from services.common.extras import check_extras
@@ -35,8 +37,6 @@ from services.common.stores import (
 from services.finding.bridges import Box
 
 _log = logging.getLogger(__name__)
-CATALOG: Final = "_catalog"
-"""Name of the catalogue's folder; no realm can have it."""
 EDITION: Final = "1"
 _KEY = "driveby.catalog"
 _LATEST_NS = (1 << 63) - 1
@@ -66,6 +66,8 @@ class CatalogUpdate(NamedTuple):
     """Lost, changed or unreadable recordings and invalid files of rows, one line each."""
     without_row: int
     """Number of closed recordings that could not be read, each of which is among the problems."""
+    deleted: int
+    """Number of recordings deleted on purpose since the last update; that is no problem."""
 
 
 def read_catalog(folder: Folder) -> CatalogContents:
@@ -139,8 +141,9 @@ def update_catalog(
     """Update the catalogue to the contents of the folder, and pack it.
 
     Missing rows are added; rows of lost or changed recordings are reported and dropped, and
-    computed again where there is a file. A file with the size and time of its row is taken to be
-    that file, unless `verify`: then its content is read and compared.
+    computed again where there is a file. Rows of recordings deleted on purpose are only dropped.
+    A file with the size and time of its row is taken to be that file, unless `verify`: then its
+    content is read and compared.
 
     Raise FailureError or InputError if the catalogue cannot be written. Without `must_write` that
     is a warning, for a caller that only needs the rows and may only read the folder.
@@ -151,6 +154,8 @@ def update_catalog(
     rows: dict[str, CatalogRow] = {}
     added = still_open = 0
     gone = before.rows.keys() - recordings.keys()
+    deleted = noted_deletions(folder, gone)
+    gone -= deleted
     problems += [f"{folder.name}/{path}: is gone; its row is dropped" for path in sorted(gone)]
     for path, entry in recordings.items():
         old = before.rows.get(path)
@@ -176,6 +181,7 @@ def update_catalog(
             problems.append(str(error))
     try:
         _pack(folder, rows, before)
+        remove_notes(folder, deleted)
     except (FailureError, InputError) as error:
         if must_write:
             raise
@@ -185,7 +191,7 @@ def update_catalog(
             *(folder.name, error),
         )
     without_row = len(recordings) - len(rows) - still_open
-    return CatalogUpdate(rows, added, still_open, tuple(problems), without_row)
+    return CatalogUpdate(rows, added, still_open, tuple(problems), without_row, len(deleted))
 
 
 def _contradiction(folder: Folder, entry: Entry, row: CatalogRow, *, verify: bool) -> str | None:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from schemas.events import Event, EventKind
 from schemas.topics import REALM, single_realm
+from services.catalogue.deletions import note_deletion
 from services.common.child_process import run_gently
 from services.common.disk import DISK, Disk
 from services.common.errors import FailureError, InputError
@@ -120,14 +121,15 @@ class Housekeeping:
             if total <= budget_bytes or self._closing.is_set():
                 break
             if self._may_go(path):
+                self._note_deletion(path)
                 path.unlink()
                 total -= sizes[path]
                 text = f"{path.name} ({sizes[path]} bytes) was deleted to keep the budget"
                 self._report(path, EventKind.RECORDING_DELETED, text)
         if total > budget_bytes and not self._is_over_budget:
             text = (
-                f"recordings take {total / 1e6:.0f} MB of the budget of {budget_bytes / 1e6:.0f} "
-                "MB, and none can be deleted, as each has crossings that are not identified"
+                f"recordings take {total / 1e6:.0f} MB of {budget_bytes / 1e6:.0f} MB, and none "
+                "of them may be deleted: no worker has identified all crossings in them"
             )
             self._report(None, EventKind.DISK_LOW, text)
         self._is_over_budget = total > budget_bytes
@@ -148,6 +150,13 @@ class Housekeeping:
         if not may_go:
             self._kept_until[path] = time.monotonic() + _ASK_AGAIN_S
         return may_go
+
+    def _note_deletion(self, path: Path) -> None:
+        """Note the deletion for the catalogue; without the note it would report a loss."""
+        try:
+            note_deletion(self._house.folder, path)
+        except (InputError, FailureError, OSError) as error:
+            _log.warning("the catalogue will report %s as gone: %s", path.name, error)
 
     def _report(self, path: Path | None, kind: EventKind, text: str, messages: int = 0) -> None:
         realm = single_realm(self._house.realms) or "live"

@@ -14,8 +14,11 @@ from schemas.events import Event, EventKind
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import GnssFix, encode_gnss
 from schemas.topics import Key, Message
+from services.catalogue.deletions import noted_deletions
+from services.catalogue.index import catalog_closed
 from services.common.child_process import ChildOutput, run_gently
 from services.common.disk import DISK
+from services.common.stores import folder_at
 from services.ledger.processed import is_processed
 from services.logger import housekeeping
 from services.logger.file_layout import RecordingTarget
@@ -224,6 +227,8 @@ def test_a_budget_deletes_the_oldest_that_may_go_and_nothing_else(
     living = RecordingWriter(day / "living.mcap", reason="test")
     sizes = {path.name: path.stat().st_size for path in day.glob("*.mcap")}
     assert kept(tmp_path, budget_bytes=sum(sizes.values())) == []
+    folder, row = folder_at(str(tmp_path)), f"sim-drive/{DAY}/1-far-away.mcap"
+    catalog_closed(tmp_path, day / "1-far-away.mcap")
     budget = sum(sizes.values()) - sizes["1-far-away.mcap"] - 10
     reported = kept(tmp_path, budget_bytes=budget)
     assert [event.kind for _, event in reported] == [EventKind.RECORDING_DELETED] * 2
@@ -231,7 +236,9 @@ def test_a_budget_deletes_the_oldest_that_may_go_and_nothing_else(
         "1-far-away.mcap",
         "2-far-away.mcap",
     ]
+    assert noted_deletions(folder, [row, "another.mcap"]) == {row}
     reported = kept(tmp_path, budget_bytes=1)
+    assert "no worker has identified all crossings in them" in reported[-1][1].text
     assert [event.kind for _, event in reported] == [
         EventKind.RECORDING_DELETED,
         EventKind.DISK_LOW,

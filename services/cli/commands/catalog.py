@@ -56,6 +56,8 @@ def _catalog(options: CatalogOptions) -> int:
         print(problem)
     rows = sorted(mended.rows.values(), key=lambda row: (row.first_ns, row.path))
     print(_summary(rows, mended.added, mended.without_row))
+    if mended.deleted:
+        print(f"{count_of(mended.deleted, 'recording')} deleted by a logger to keep its budget")
     if mended.still_open:
         print(f"{count_of(mended.still_open, 'more recording')} being written")
     table = list(_table_of_rows(rows))

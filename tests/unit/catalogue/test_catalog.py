@@ -19,6 +19,7 @@ from schemas.site import Site
 from schemas.topics import Key, Message
 from services.catalogue import index as catalog
 from services.catalogue.contents import summarise_recording
+from services.catalogue.deletions import note_deletion
 from services.catalogue.index import CATALOG, read_catalog, update_catalog
 from services.catalogue.positions import crossings_of
 from services.cli import main as cli
@@ -171,7 +172,7 @@ def test_truck_away_at_both_ends_may_have_crossed(tmp_path: Path, site: Site) ->
 def test_mending_names_what_is_gone_and_changed(fleet: Path, site: Site) -> None:
     folder = folder_at(str(fleet))
     assert update_catalog(folder).added == 3
-    assert update_catalog(folder)[1:] == (0, 0, (), 0)
+    assert update_catalog(folder)[1:] == (0, 0, (), 0, 0)
     a, b, c = (fleet / f"live/2023-11-14/{name}.mcap" for name in "abc")
     a.unlink()
     record(b.with_name("new.mcap"), drive(site, range(20), (10,)))
@@ -193,13 +194,31 @@ def test_mending_names_what_is_gone_and_changed(fleet: Path, site: Site) -> None
     assert read_catalog(folder).rows == mended.rows
 
 
+def test_deletion_by_a_budget_is_no_loss(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The next recording that disappears without a note is reported, even at the same path."""
+    folder = folder_at(str(fleet))
+    update_catalog(folder)
+    path = fleet / "live/2023-11-14/a.mcap"
+    content = path.read_bytes()
+    note_deletion(fleet, path)
+    path.unlink()
+    assert cli.main(["catalog", str(fleet)]) == 0
+    assert "1 recording deleted by a logger to keep its budget\n" in capsys.readouterr().out
+    assert update_catalog(folder)[1:] == (0, 0, (), 0, 0)
+    path.write_bytes(content)
+    assert cli.main(["catalog", str(fleet)]) == 0
+    path.unlink()
+    assert cli.main(["catalog", str(fleet)]) == 3
+    assert "a.mcap: is gone; its row is dropped" in capsys.readouterr().out
+
+
 def test_a_file_that_was_touched_keeps_its_row(fleet: Path) -> None:
     folder = folder_at(str(fleet))
     before = update_catalog(folder).rows
     path = fleet / "live/2023-11-14/a.mcap"
     os.utime(path, ns=(0, path.stat().st_mtime_ns + S))
     mended = update_catalog(folder)
-    assert mended[1:] == (0, 0, (), 0)
+    assert mended[1:] == (0, 0, (), 0, 0)
     assert {r.content for r in mended.rows.values()} == {r.content for r in before.values()}
 
 
@@ -259,7 +278,7 @@ def test_kill_during_packing_leaves_rows_that_count_once(
             update_catalog(folder)
     assert len(list((fleet / CATALOG).rglob("*.parquet"))) == 4
     assert read_catalog(folder).rows == truth
-    assert update_catalog(folder) == (truth, 0, 0, (), 0)
+    assert update_catalog(folder) == (truth, 0, 0, (), 0, 0)
     assert len(list((fleet / CATALOG).rglob("*.parquet"))) == 1
 
 
@@ -398,7 +417,7 @@ def test_a_recording_that_is_being_written_is_no_problem(
         assert cli.main(["catalog", str(fleet)]) == 0
         assert "1 more recording being written" in capsys.readouterr().out
     path.write_bytes(whole)
-    assert update_catalog(folder_at(str(fleet)))[1:] == (1, 0, (), 0)
+    assert update_catalog(folder_at(str(fleet)))[1:] == (1, 0, (), 0, 0)
 
 
 def test_a_damaged_recording_is_no_success(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -431,7 +450,7 @@ def check_away(fleet: Path, url: str, site: Site) -> None:
     first, again = update_catalog(away), update_catalog(away)
     assert {path: row.content for path, row in first.rows.items()} == truth
     assert (first.added, first.problems) == (3, ())
-    assert again == (first.rows, 0, 0, (), 0)
+    assert again == (first.rows, 0, 0, (), 0, 0)
     found = crossings_of(away, again.rows.values(), site)
     assert found == crossings_of(here, update_catalog(here).rows.values(), site)
     assert len(found.crossings) == 3

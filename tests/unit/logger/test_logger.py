@@ -292,4 +292,4 @@ def test_a_file_that_is_closed_has_its_row_in_the_catalogue(tmp_path: Path) -> N
         (("truck-1",), 3),
         (("truck-2",), 2),
     ]
-    assert update_catalog(folder_at(str(tmp_path))) == (rows, 0, 0, (), 0)
+    assert update_catalog(folder_at(str(tmp_path))) == (rows, 0, 0, (), 0, 0)
