@@ -4,7 +4,7 @@ import csv
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 from typing import Final
 
@@ -14,6 +14,8 @@ from services.common.files import read_text
 
 _FARTHEST_S: Final = 3 * 3600.0
 """Longest time in s between a temperature and a crossing that it describes."""
+_MILLISECONDS_S: Final = 1e11
+"""Distance in s, some 3,000 years, beyond which times are taken to be in milliseconds."""
 _LOWEST, _HIGHEST = -60.0, 80.0
 
 
@@ -31,6 +33,35 @@ def temperatures_of(path: Path, crossings: Iterable[CrossingResult]) -> dict[str
         if value is not None:
             found[crossing.crossing_id] = value
     return found
+
+
+def nearest_row_s(path: Path, crossings: Iterable[CrossingResult]) -> float:
+    """Return the shortest time in s between a crossing and a row that applies to its bridge.
+
+    It is infinite where no row applies.
+    """
+    rows = _rows(path)
+    return min(
+        (
+            abs(time_s - 0.5 * (crossing.entry_time + crossing.exit_time))
+            for crossing in crossings
+            for time_s, _ in rows.get(crossing.bridge) or rows.get("") or []
+        ),
+        default=inf,
+    )
+
+
+def no_match(path: Path, nearest_s: float) -> str:
+    """Return why no temperature matched, from the time to the nearest row that applies."""
+    if nearest_s == inf:
+        return f"no row of {path} applies to these bridges"
+    away = (
+        f"{nearest_s / 3600:.1f} hours"
+        if nearest_s < 2 * 86400
+        else f"{nearest_s / 86400:.0f} days"
+    )
+    units = "; the rows seem to be in milliseconds" if nearest_s > _MILLISECONDS_S else ""
+    return f"the nearest row of {path} is {away} away (time_s is Unix time in s){units}"
 
 
 def _rows(path: Path) -> dict[str, list[tuple[float, float]]]:

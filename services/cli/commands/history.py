@@ -1,6 +1,7 @@
 """The command `driveby history`: results over years, and one bridge over time."""
 
 import json
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -123,16 +124,19 @@ def _add_one(
     options: HistoryOptions, path: Path, some: "Iterable[Results]", driven: "set[HistoryEntry]"
 ) -> str:
     """Add a file or a folder, record the positions of its crossings, and return a summary."""
-    from services.history.add_summary import summed
+    from services.history.add_summary import AddSummary, summed
     from services.history.bridge_history import HistoryEntry
     from services.history.history_store import add_results
-    from services.history.temperatures import temperatures_of
+    from services.history.temperatures import nearest_row_s, no_match, temperatures_of
 
-    parts, warm = [], set[str]()
+    parts, warm, nearest_s = [], set[str](), math.inf
     for results in some:
         known = {}
         if options.temperature is not None:
             known = temperatures_of(options.temperature, results.crossings)
+            if not known:
+                away_s = nearest_row_s(options.temperature, results.crossings)
+                nearest_s = min(nearest_s, away_s)
         parts.append(add_results(options.history, results, known))
         warm.update(known)
         driven.update(
@@ -143,6 +147,8 @@ def _add_one(
     newer = f", {len(total.replaced)} replaced" if total.replaced else ""
     before = f", {len(total.known)} there already" if total.known else ""
     beside = f", {len(warm)} with a temperature" if options.temperature is not None else ""
+    if options.temperature is not None and not warm and total != AddSummary():
+        beside += f": {no_match(options.temperature, nearest_s)}"
     return f"{path}: {count_of(len(total.added), 'crossing')}{of} added{newer}{before}{beside}"
 
 

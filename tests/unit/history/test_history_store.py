@@ -273,6 +273,28 @@ def test_temperatures_beside_crossings(tmp_path: Path) -> None:
         temperatures_of(path, some.crossings)
 
 
+def test_temperatures_without_a_match_are_explained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    some = crossings(1)
+    found, path = tmp_path / "r.json", tmp_path / "t.csv"
+    found.write_text(results_json(some))
+    at_s = 0.5 * (some.crossings[0].entry_time + some.crossings[0].exit_time)
+    tail = " away (time_s is Unix time in s)"
+    for rows, why in (
+        (f"{at_s - 4 * 3600},10,", f"the nearest row of {path} is 4.0 hours{tail}"),
+        (f"{at_s + 9 * DAY_S},10,", f"the nearest row of {path} is 9 days{tail}"),
+        (f"{at_s},10,other", f"no row of {path} applies to these bridges"),
+    ):
+        path.write_text(f"time_s,temperature_deg_c,bridge\n{rows}\n")
+        words = ["history", "add", str(found), "--temperature", str(path), "--defer-fusion"]
+        assert cli.main([*words, "--history", str(tmp_path / "h")]) == 0
+        assert capsys.readouterr().out.endswith(f", 0 with a temperature: {why}\n")
+    path.write_text(f"time_s,temperature_deg_c\n{at_s * 1e3},10\n")
+    assert cli.main([*words, "--history", str(tmp_path / "h")]) == 0
+    assert capsys.readouterr().out.endswith("; the rows seem to be in milliseconds\n")
+
+
 def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     history, found = str(tmp_path / "history"), tmp_path / "r.json"
     found.write_text(results_json(crossings(5)))
