@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from schemas.toml_text import parse_toml, read_toml_text
+from schemas.topics import check_realms
 from services.common.errors import InputError
 
 CONFIG: Final = "--config"
@@ -99,6 +100,11 @@ def _checked(action: argparse.Action, where: str, value: str | float) -> str:
     """Return the text of a value if the option accepts it."""
     text = str(value)
     parsed: object = text
+    if _key(action) == "realm" and isinstance(value, str):
+        try:
+            check_realms(text)
+        except ValueError as error:
+            raise InputError(f"{where}: {str(error).removeprefix('realm ')}") from None
     if callable(action.type):
         try:
             parsed = action.type(text)

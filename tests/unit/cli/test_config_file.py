@@ -55,6 +55,7 @@ def test_command_line_overrides_an_alternative_of_the_file(tmp_path: Path) -> No
         ("rotate_minute = 5", "rotate_minute: is unknown, did you mean rotate_minutes?"),
         ("connect = 5", "connect: is unknown, check its spelling or remove it"),
         ("folder = 5", 'folder: is 5, it must be a text in quotes: "5"'),
+        ('realm = "Live"', "realm: 'Live' must be live, replay-NAME, sim-NAME or import-NAME"),
         ("realm = [7]", 'realm: is 7, it must be a text in quotes: "7"'),
         ('config = "x.toml"', "config: is unknown"),
         ('rotate_minutes = "x"', "rotate_minutes: is"),
