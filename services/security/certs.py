@@ -155,7 +155,8 @@ def certs_command(asked: CertsSettings) -> list[str]:
             _issue(folder, authority, key, subject, hosts, asked.days)
         _write_access_control(folder, authority)
     except OSError as error:
-        raise FailureError(f"{folder}: {error.strerror}: {error.filename}") from None
+        where = folder if error.filename is None else error.filename
+        raise FailureError(f"{where}: cannot be written: {error.strerror}") from None
     return [*_changes(folder, authority, renewed, revoked), *_summary(folder, authority)]
 
 

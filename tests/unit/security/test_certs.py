@@ -1,6 +1,7 @@
 """The files of `driveby certs`: what they say, who may read them, what is never overwritten."""
 
 import contextlib
+import errno
 import ipaddress
 import json
 import logging
@@ -29,7 +30,7 @@ from services.bus.credentials import (
     read_certificate,
 )
 from services.bus.session import open_session
-from services.common.errors import InputError
+from services.common.errors import FailureError, InputError
 from services.security import certs
 from services.security.certs import certs_command
 from services.security.settings import CertsSettings
@@ -69,6 +70,20 @@ def test_everybody_gets_what_they_need(folder: Path) -> None:
             *("logger/logger", "replay/replay", "router/router"),
             *("truck/truck-1", "viewer/viewer", "worker/worker"),
         }
+
+
+def test_full_disk_is_named_with_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A write that fails has no file name in its error."""
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(certs, "_write_access_control", fail)
+    settings = CertsSettings(folder=tmp_path / "certs", add=["truck/truck-1"])
+    with pytest.raises(FailureError, match=r"certs: cannot be written: No space left on device$"):
+        certs_command(settings)
 
 
 def test_private_keys_are_private(folder: Path) -> None:
