@@ -52,10 +52,20 @@ def write_all(file: RawFile, data: bytes) -> None:
         view = view[taken:]
 
 
+def is_virtual(folder: Path) -> bool:
+    """Return whether the file system of a folder has no room at all, as /proc."""
+    return shutil.disk_usage(_existing(folder)).total == 0
+
+
 def _free_bytes(folder: Path) -> int:
+    return shutil.disk_usage(_existing(folder)).free
+
+
+def _existing(folder: Path) -> Path:
+    """Return the folder, or its nearest parent that exists."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
-    return shutil.disk_usage(folder).free
+    return folder
 
 
 DISK = Disk(

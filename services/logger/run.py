@@ -29,7 +29,7 @@ from services.bus.playback import leave_at_once, stopped_by_signals
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
 from services.bus.subscription import RawSample, Subscription
-from services.common.disk import DISK
+from services.common.disk import DISK, is_virtual
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
 from services.common.interrupts import handled_by
@@ -412,6 +412,8 @@ def _site_text(site: Path | None) -> Callable[[], str] | None:
 def _check_room(folder: Path, min_free_bytes: int) -> None:
     free_bytes = DISK.free_bytes(folder)
     if free_bytes < min_free_bytes:
+        if is_virtual(folder):
+            raise InputError(f"{folder}: cannot be created, its file system stores no files")
         raise FailureError(
             f"only {free_bytes / 1e6:.0f} MB left on the disk of {folder}, "
             f"{min_free_bytes / 1e6:.0f} MB are wanted (--min-free)"

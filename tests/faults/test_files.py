@@ -27,7 +27,7 @@ from schemas.signals import (
 )
 from schemas.topics import Key, Message
 from services.common.disk import DISK, Disk
-from services.common.errors import FailureError
+from services.common.errors import FailureError, InputError
 from services.logger import file_layout, open_files
 from services.logger import run as logger
 from services.logger import writer as writer_module
@@ -353,6 +353,11 @@ def test_low_space_is_reported_and_ends_recording_early(
     assert end["reason"] == writer.failure
     kinds = [kind for p in tmp_path.glob("live/*/*.mcap") for kind in events_of(p)]
     assert set(kinds) == {EventKind.DISK_LOW}
+
+
+def test_logger_folder_below_proc_is_no_full_disk() -> None:
+    with pytest.raises(InputError, match=r"/proc/new: cannot be created, its file system stores"):
+        logger._check_room(Path("/proc/new"), 1)
 
 
 def test_the_logger_does_not_start_without_room(tmp_path: Path) -> None:
