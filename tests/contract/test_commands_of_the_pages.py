@@ -45,7 +45,7 @@ NOT_RUN = {
     "driveby identify s3://bucket/fleet --into identified": (
         "tests/unit/cli/test_cluster.py has a store"
     ),
-    'pytest tests/verdicts/test_faults.py -m slow -k "5 and t] or span"': LONG,
+    'pytest tests/verdicts/test_faults.py -m slow -k "second or span"': LONG,
     "python -m tests.benchmarks.fleet --out /tmp/fleet": LONG,
     "python -m tests.benchmarks.alarms": LONG,
     "make year": LONG,
