@@ -52,10 +52,13 @@ def add_tyre_damping(force: FloatArray, lag_steps: float, soft: float, road: Flo
     """Add to `road` (n,), the negative profile, the part of a tyre's deflection due to damping.
 
     `force` (n,) is the tyre's compressive force, `lag_steps` tau over the step, `soft` 1/k. At both
-    ends, where samples are missing, the force is linear between two of them.
+    ends, where samples are missing, the force is linear between two of them. Negative damping, by
+    which a search passes zero, has the opposite effect of positive one.
     """
-    if lag_steps <= 0.0:
+    if lag_steps == 0.0:
         return
+    if lag_steps < 0.0:
+        lag_steps, soft = -lag_steps, -soft
     moments, weights = np.empty(_POINTS), np.zeros(_POINTS)
     _moments(lag_steps, moments)
     for m in range(_POINTS):

@@ -8,7 +8,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pre_core.physics.road import Profile
 from schemas.site import Site
 from schemas.topics import Message
 from services.common.errors import InputError
@@ -168,7 +167,6 @@ def simulate(
     """
     if (scenario is None) == (ei is None):
         raise InputError(_NO_TRUTH)
-    is_forward = _is_forward(direction)
     number_of = None if scenario is None else whole("scenario", scenario, 1, _SCENARIOS)
     ratios = None if ei is None else numbers("ei", ei, 1e-3, 1e3, _RATIOS)
     speeds = one_or_two("speed", speed, 0.1, 60, "(start, end)")
@@ -177,14 +175,15 @@ def simulate(
     known = paper_site() if site is None else middle_site(given_site(site))
     asked = None if noise is None else number("noise", noise, 0, 1e6)
     density = noise_density_of(None if site is None else known, asked)
-    of_road = road_class_of(known, None) if road is None else given_road(road)
-    for line in _doubts(ratios, max(speeds), of_road):
+    kind = road_class_of(known, None) if road is None else given_road(road)
+    driven = DrivenRoad(kind, whole("seed", seed, 0, (1 << 63) - 1))
+    for line in _doubts(ratios, max(speeds), driven):
         warnings.warn(line, stacklevel=3)
     with one_blas_thread():
         drive = simulate_drive(
             known,
             ratios_of(known.bridges[0], number_of, ratios, prefix=""),
-            DrivenRoad(of_road, whole("seed", seed, 0, (1 << 63) - 1)),
+            driven,
             Measurement(
                 density,
                 rate_hz=None if rate is None else number("rate", rate, 50, 50_000),
@@ -192,7 +191,7 @@ def simulate(
                 least_road_m=(0.0, 0.0) if site is None else SURVEY_ROAD_M,
             ),
             speed_m_per_s=speeds,
-            forward=is_forward,
+            forward=_is_forward(direction),
             beyond=OutOfModelEffects(twist=twist_of(known.bridges[0])),
         )
     return Simulation(drive, declared_site(known, density, drive.run.rate_hz))
@@ -206,7 +205,7 @@ def _is_forward(direction: str) -> bool:
 
 
 def _doubts(
-    ratios: Sequence[float] | None, speed_m_per_s: float, road: str | Profile
+    ratios: Sequence[float] | None, speed_m_per_s: float, driven: DrivenRoad
 ) -> Iterator[str]:
     """Yield a sentence for each value that is likely of another unit."""
     if ratios is not None and max(ratios) > _LARGEST_RATIO:
@@ -216,6 +215,7 @@ def _doubts(
             f"speed is {speed_m_per_s:g} m/s, {3.6 * speed_m_per_s:.0f} km/h: is it in km/h? "
             "m/s are expected"
         )
+    road = driven.kind
     if not isinstance(road, str):
         slope = float(np.sqrt(np.mean((np.diff(road.height_m) / np.diff(road.x_m)) ** 2)))
         if slope > 1.0:

@@ -282,6 +282,8 @@ def _plain_record_at(file: BinaryIO, at: int, opcode: int, length: int) -> _Mcap
             return None
     except _UNREADABLE:
         return None
+    if isinstance(record, Footer) and max(record.summary_start, record.summary_offset_start) > at:
+        return None  # any 20 bytes make a footer; a true one follows its summary
     wanted = (Schema, Channel, Attachment, Metadata, DataEnd, Footer)
     return _found(end, *([record] if isinstance(record, wanted) else []))
 

@@ -111,6 +111,24 @@ def test_tyre_damping_is_exact_at_the_models_rate(tau_s: float) -> None:
     assert error_of_tyre(3e-3, 42.0, tau_s) < 2e-5
 
 
+def test_negative_damping_continues_positive_one() -> None:
+    """A search passes zero: there the effect of damping is odd, and has one slope."""
+    step, hz = 3e-3, 20.0
+    data, at, _ = sine_crossing(step, hz)
+    work = allocate_buffers(data, at.theta.shape[1], row_filter(step))
+
+    def heights(tau_s: float) -> FloatArray:
+        at.theta[0, C_U1] = tau_s * TRUCK.tyre_stiffness_n_per_m[0]
+        found, _ = roads_and_deflections(data, work, at, 0)
+        return found[0].copy()
+
+    undamped = heights(0.0)
+    for tau_s in (1e-6, 1e-3):
+        effect = heights(tau_s) - undamped
+        assert np.abs(effect).max() > 0.0
+        np.testing.assert_allclose(heights(-tau_s) - undamped, -effect, atol=1e-12)
+
+
 def test_tyre_damping_converges_as_the_interpolation_of_the_force() -> None:
     """Ten samples: the error of F between two of them goes with the tenth power of the step."""
     steps = 5e-3 * np.array([1.0, 0.8, 0.64])

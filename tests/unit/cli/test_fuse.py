@@ -208,7 +208,7 @@ def test_fused_intervals_without_a_passed_site_validation_have_one_line(
     line = "truck-1 on bridge-1: the results name no passed site validation; give --site SITE.toml"
     assert capsys.readouterr().out.count(line) == 1
     asked += ["--site", str(toml), "--validations", str(tmp_path)]
-    for words in (f"The folder {tmp_path.name} has no site validation of", "Site validation of"):
+    for words in (f"The folder {tmp_path} has no site validation of", "Site validation of"):
         assert main(asked) == 0
         assert capsys.readouterr().out.count(f"bridge-1: {words} truck-1 on this bridge") == 1
         save(tmp_path, certificate(site, passed=False))

@@ -508,7 +508,7 @@ def test_bridge_without_site_validation_has_one_line(
     site = paper_site()
     found = results_of(site, some_crossing("a"), some_crossing("b", entry=60.0))
     failed = certificate(site, passed=False)
-    here = f"The folder {tmp_path.name} has no site validation of"
+    here = f"The folder {tmp_path} has no site validation of"
     for folder, words in ((tmp_path, here), (tmp_path, "Site validation of")):
         print_validation(Console(), found, site, folder)
         out = capsys.readouterr().out

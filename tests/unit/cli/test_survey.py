@@ -36,7 +36,7 @@ def test_a_plan_of_the_example(
     out, errors = capsys.readouterr()
     assert "forecasting 12 crossings of bridge-1 by truck-1 and the alternatives: 10 p" in errors
     assert "at … t: at most 18 t, with three axles 26 t, as in the EU" in out
-    assert "\nmidspan: EI_4, at the middle of the longest span;\n" in out
+    assert "\nmidspan: EI_4, at the middle of the longest span\n" in out
     plan = json.loads(found.read_text(encoding="utf-8"))
     last, middle = plan["growth"][-1], plan["planned"]["middle_element"] - 1
     assert last["crossings"] == 300
