@@ -5,13 +5,14 @@ they get an answer. studies/faults.md has the table (`python -m tests.verdicts.m
 """
 
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
-from pre_core.crossing import optimum
+from pre_core.crossing import optimum, sampling
 from pre_core.crossing.fit import Optimum
+from pre_core.crossing.sampling import PosteriorDraws
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
@@ -210,9 +211,18 @@ def test_how_large_chi2_may_be_depends_on_the_pattern_up_to_25(
     pattern: Reason,
     verdict: str,
 ) -> None:
-    """The very fit of a sound crossing, said to be as bad as that: only the rule is looked at."""
+    """The very fit of a sound crossing, said to be as bad as that: only the rule is looked at.
+
+    Draws are those of the sound noise: of 24 times as much they take chains, and 20 s.
+    """
     fit = fit_of_loud._replace(chi2_per_dof=chi2)
+
+    def sample_of_sound(*what: Any, inflation: float, **how: Any) -> PosteriorDraws:
+        assert inflation == pytest.approx(np.sqrt(chi2))
+        return sampling.sample(*what, **how)
+
     monkeypatch.setattr(optimum, "find_optimum", lambda *_: fit)
+    monkeypatch.setattr(pre_method, "sample", sample_of_sound)
     monkeypatch.setattr(fit_reasons, "reasons_after_fit", lambda *_: [pattern])
     result = faults.identified(faults.crossing(LOUD), RULED)
     assert result.verdict == verdict
