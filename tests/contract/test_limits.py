@@ -6,14 +6,19 @@ no reason. What is renamed or moved keeps its number, or a smaller one.
 """
 
 import ast
+import gc
 import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+
+# They share the parsed modules with tests/contract/test_words.py.
+pytestmark = pytest.mark.xdist_group("parsed modules")
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("driveby", "pre_core", "schemas", "services", "studies")
@@ -80,17 +85,30 @@ def module_of(name: str, text: str) -> Module:
     return Module(name, text, ast.parse(text))
 
 
-@pytest.fixture(scope="module")
-def modules() -> list[Module]:
-    """All modules but the generated ones."""
-    found = []
-    for package in PACKAGES:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            if not path.stem.endswith("_pb2"):
-                name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-                found.append(module_of(name, path.read_text()))
+@cache
+def modules_by_path() -> dict[Path, Module]:
+    """Return all modules but the generated ones, which are parsed once for two files of tests."""
+    found = {}
+    # The trees live to the end: a search for garbage among them takes longer than to make them.
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        for package in PACKAGES:
+            for path in sorted((ROOT / package).rglob("*.py")):
+                if not path.stem.endswith("_pb2"):
+                    name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+                    found[path] = module_of(name, path.read_text())
+    finally:
+        if was_on:
+            gc.freeze()
+            gc.enable()
     assert len(found) > 200, "or it looks in the wrong place"
     return found
+
+
+@pytest.fixture(scope="module")
+def modules() -> list[Module]:
+    return [*modules_by_path().values()]
 
 
 def definitions(node: ast.AST, of: str = "") -> Iterator[tuple[str, ast.AST]]:

@@ -10,7 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.contract.test_limits import PACKAGES, ROOT, Module, definitions, module_of
+from tests.contract.test_limits import ROOT, Module, definitions, module_of, modules_by_path
+
+# They share the parsed modules with tests/contract/test_limits.py.
+pytestmark = pytest.mark.xdist_group("parsed modules")
 
 FIRST_WORDS = ("Of", "That", "So", "Who", "Whoever", "By", "What", "How", "As", "Less")
 NOT_A_VERB_FOR_CODE = re.compile(r"(?<![a-z])(told|tells?|telling)(?![a-z])", re.IGNORECASE)
@@ -24,10 +27,8 @@ SHAPE = re.compile(r"\([\w…+ -]{1,12},([\w…+, -]{1,40})?\)|\(…\)|\bshape\b
 def modules() -> list[Module]:
     """Our modules, without those that a compiler wrote."""
     return [
-        module_of(path.relative_to(ROOT).as_posix(), path.read_text())
-        for package in PACKAGES
-        for path in sorted((ROOT / package).rglob("*.py"))
-        if not path.stem.endswith("_pb2")
+        module._replace(name=path.relative_to(ROOT).as_posix())
+        for path, module in modules_by_path().items()
     ]
 
 
