@@ -1,5 +1,6 @@
 """The page docs/validation.md, from the results of a validation of method `pre`."""
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -34,9 +35,11 @@ No real bridge is among the crossings: no public recording of one is known.
 
 {aims}
 
-Targets of the tables on out-of-model effects and an independent simulator are listed only where
-missed.
+{missed} of {all} targets are missed.{unlisted}
 """
+
+_UNLISTED = """ Those of the tables on out-of-model effects and an independent simulator are
+listed only where missed. Met of them: {met}."""
 
 _DRAWN = """
 ## Crossings drawn from the priors
@@ -170,6 +173,9 @@ def validation_page(outcome: ValidationOutcome, image: str = "images/calibration
         each=_each(outcome),
         edition=METHOD_EDITION,
         aims=_aims(listed),
+        missed=sum(not check.is_met for check in listed),
+        all=len(aims(outcome)),
+        unlisted=_unlisted(in_tables),
     )
     if len(outcome.drawn) > 1:
         text += _drawn(outcome, image)
@@ -227,6 +233,14 @@ def _aims(checks: list[Aim]) -> str:
             f"| {name} | {measured}{note} | {wanted} | {'met' if check.is_met else '**missed**'} |"
         )
     return "\n".join(rows)
+
+
+def _unlisted(in_tables: Sequence[Aim]) -> str:
+    """Return how many targets of each effect and simulated run are met; "" without any."""
+    all_of = Counter(check.name.split(":")[0] for check in in_tables)
+    met_of = Counter(check.name.split(":")[0] for check in in_tables if check.is_met)
+    met = ", ".join(f"{name}: {met_of[name]} of {count}" for name, count in all_of.items())
+    return _UNLISTED.format(met=met) if met else ""
 
 
 def _wanted(check: Aim) -> str:

@@ -3,6 +3,7 @@
 import copy
 import io
 import logging
+import re
 from pathlib import Path
 from typing import Any
 
@@ -274,6 +275,18 @@ def test_page_holds_every_aim_and_every_part() -> None:
     assert "{" not in page
     left_out = validation_page(outcome._replace(judged=[], judged_from=None))
     assert "Not judged in this run" in left_out
+
+
+def test_page_counts_listed_and_unlisted_targets() -> None:
+    outcome = _outcome()
+    outcome = outcome._replace(judged=[_judged(), _judged(run=1, verdict="suspect")])
+    page = " ".join(validation_page(outcome).split())
+    listed = page.count("| met |") + page.count("| **missed** |")
+    assert "Met of them: d1 run 0: 4 of 4, d1 run 1: 3 of 4." in page
+    missed_, all_ = re.search(r"(\d+) of (\d+) targets are missed", page).groups()  # type: ignore[union-attr]
+    assert int(missed_) == page.count("| **missed** |")
+    assert int(all_) == listed + 4 + 3 == len(aims(outcome))
+    assert "Met of them" not in validation_page(outcome._replace(judged=[]))
 
 
 def test_a_missed_aim_stands_out_on_page_and_screen() -> None:
