@@ -54,6 +54,7 @@ from services.history.validation_files import (
     passed_validations,
 )
 from services.identification.baseline_cautions import RealmsOfBridges, baseline_cautions
+from services.identification.bridge_remarks import bridge_remarks
 from services.identification.bridge_state import FusionSettings
 from services.identification.methods import lacks_noise
 from services.ledger.baselines import Baselines, baselines_of, realms_of_bridges
@@ -310,6 +311,8 @@ def _as_state(bridge: Bridge, state: BridgeResult) -> str:
 def _print_crossing(
     console: "Console", crossing: CrossingResult, site: Site, *, is_level_stated: bool
 ) -> None:
+    from rich.markup import escape
+
     method = crossing.method.replace("_", " ")
     console.print(
         f"[bold]{crossing.crossing_id}[/]\n"
@@ -340,6 +343,8 @@ def _print_crossing(
         )
     for line in _fit_lines(crossing, is_level_stated=is_level_stated):
         console.print(line, highlight=False)
+    for remark in bridge_remarks([crossing]):
+        console.print(f"[bold]remark:[/] {escape(remark)}", highlight=False, soft_wrap=True)
 
 
 def _below(derived: Derived) -> dict[str, dict[str, float]] | None:

@@ -41,7 +41,7 @@ it."""
 _SMALLEST_CHI2 = 0.6
 """Smallest chi2 per degree of freedom without noise far below the declared, which makes intervals
 too wide."""
-_LARGEST_VEHICLE_Z = 4.0
+LARGEST_PRIOR_Z = 4.0
 """Largest plausible distance of a truck's parameter from its prior, in standard deviations."""
 _MAX_NAMED = 3
 _LARGEST_POSITION_Z = 4.0
@@ -153,7 +153,7 @@ def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
     is_unexplained = bool({Reason.MODEL_MISFIT, Reason.RESIDUALS_COLOURED} & set(reasons))
     if fit.off_bridge_m < SHORTEST_APPROACH_M and (fit.has_two_roads or is_unexplained):
         reasons.append(Reason.APPROACH_TOO_SHORT)
-    if fit.prior_z and max(abs(z) for z in fit.prior_z.values()) > _LARGEST_VEHICLE_Z:
+    if fit.prior_z and max(abs(z) for z in fit.prior_z.values()) > LARGEST_PRIOR_Z:
         reasons.append(Reason.IMPLAUSIBLE_VEHICLE)
     if (
         fit.mismatch_excess > _MISMATCH_EXCESS
@@ -357,7 +357,7 @@ def undeclared_axles(
 
 def odd_parameters(fit: Fit) -> str:
     """Return the names of implausible truck parameters, most deviating first, or ""."""
-    far = {name: z for name, z in fit.prior_z.items() if abs(z) > _LARGEST_VEHICLE_Z}
+    far = {name: z for name, z in fit.prior_z.items() if abs(z) > LARGEST_PRIOR_Z}
     named = sorted(far, key=lambda name: -abs(far[name]))[:_MAX_NAMED]
     if not named:
         return ""

@@ -20,10 +20,14 @@ from pre_core.crossing.tandem_friction import tandem_friction
 from pre_core.physics.beam_basis import first_frequencies_hz
 from pre_core.search.loop import Termination
 from schemas.reasons import Reason
+from schemas.results import Derived
+from schemas.site import Bridge
 from services.common.arrays import Floats
 from services.finding.crossing_data import CrossingData
 from services.finding.placed import first_axle, middle_names
+from services.identification.bridge_remarks import FREQUENCY_RATIO, PRIOR_Z
 from services.identification.checks import (
+    LARGEST_PRIOR_Z,
     Fit,
     coarse_converters,
     is_biased_by_mismatch,
@@ -137,14 +141,43 @@ def _wrong_bridge(data: CrossingData, found: Optimum) -> str:
     return contradicted_frequency(fitted_hz, declared_hz)
 
 
+def is_contradicted_frequency(fitted_hz: float, declared_hz: float) -> bool:
+    """Return whether a first frequency is far from the declared one."""
+    return not 1.0 / _CONTRADICTION <= fitted_hz / declared_hz <= _CONTRADICTION
+
+
 def contradicted_frequency(fitted_hz: float, declared_hz: float) -> str:
     """Return the sentence on a first frequency far from the declared one; "" if it is near."""
-    if 1.0 / _CONTRADICTION <= fitted_hz / declared_hz <= _CONTRADICTION:
+    if not is_contradicted_frequency(fitted_hz, declared_hz):
         return ""
     return (
         f"the estimated first frequency is {fitted_hz:.3g} Hz, declared {declared_hz:.3g} Hz, so "
         "the search may have ended at wrong bridge values"
     )
+
+
+def contradictions(
+    bridge: Bridge, problem: posterior.PosteriorProblem, draws: Floats, derived: Derived
+) -> dict[str, float]:
+    """Return, as diagnostics, the bridge parameters other than EI that contradict the site file.
+
+    `draws` (steps, chains, f) are search coordinates. A parameter is listed with the deviation of
+    its mean, in logarithms where the prior is log-normal, beyond 4 standard deviations of it.
+    """
+    priors = problem.priors
+    theta = posterior.values_of(problem, draws.reshape(-1, draws.shape[2])).theta
+    found = {}
+    for i in range(parameters.FIRST_OF_BRIDGE, parameters.EI_1):
+        if not priors.estimated[i]:
+            continue
+        values = theta[:, i] if priors.half_normal[i] else np.log(theta[:, i] / priors.theta[i])
+        z = float(values.mean() / priors.spread[i])
+        if abs(z) > LARGEST_PRIOR_Z:
+            found[f"{PRIOR_Z}{parameters.SCALARS[i].name}"] = z
+    f1_hz, declared_hz = derived.f1_hz.mean, bridge.first_frequency_hz
+    if declared_hz is not None and is_contradicted_frequency(f1_hz, declared_hz):
+        found[FREQUENCY_RATIO] = f1_hz / declared_hz
+    return found
 
 
 def _fit(data: CrossingData, found: Optimum) -> Fit:

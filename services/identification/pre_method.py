@@ -30,7 +30,7 @@ from services.common.arrays import Floats
 from services.finding.crossing_data import CrossingData
 from services.finding.placed import first_axle
 from services.identification.checks import stiffer_elements, undeclared_axles
-from services.identification.fit_reasons import reasons_of_fit
+from services.identification.fit_reasons import contradictions, reasons_of_fit
 from services.identification.footprints import (
     displaced_leads_of,
     footprints_of,
@@ -237,6 +237,7 @@ def identify_pre(
         reasons.append(Reason.IMPLAUSIBLE_BRIDGE)
     reasons += caveats(data, cut.motion)
     values = _values(data, found.problem, chain, settings, run.keep)
+    diagnostics |= contradictions(data.bridge, found.problem, chain.draws, values["derived"])
     diagnostics["seconds"] = run.elapsed()
     once = tuple(dict.fromkeys(reasons))
     return results.CrossingResult(

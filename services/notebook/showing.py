@@ -8,6 +8,7 @@ from typing import Final
 from schemas.reasons import Reason
 from schemas.results import CrossingResult, ElementState, Parameter
 from schemas.site import Bridge
+from services.identification.bridge_remarks import bridge_remarks
 
 MAX_SHOWN: Final = 20
 """Largest number of crossings that a notebook shows."""
@@ -37,7 +38,7 @@ def counted(crossings: Sequence[CrossingResult]) -> str:
 
 
 def as_html(crossing: CrossingResult, bridge: Bridge) -> str:
-    """Return the verdict with its reasons, and a table of the elements."""
+    """Return the verdict with its reasons, remarks on the bridge, and a table of the elements."""
     heading = (
         f"<p><b>{escape(crossing.crossing_id)}</b>: {crossing.verdict}, "
         f"{escape(crossing.vehicle)} over {escape(crossing.bridge)}, "
@@ -47,6 +48,9 @@ def as_html(crossing: CrossingResult, bridge: Bridge) -> str:
     if crossing.reasons:
         pairs = zip(crossing.reasons, crossing.reason_texts, strict=True)
         parts.append(_list(f"{escape(code)}: {escape(text)}" for code, text in pairs))
+    remarks = tuple(bridge_remarks([crossing]))
+    if remarks:
+        parts.append(_list(map(escape, remarks)))
     rows = []
     start_m = 0.0
     has_interval = Reason.NO_NOISE_MODEL not in crossing.reasons

@@ -16,6 +16,7 @@ from services.identification.baseline_cautions import (
     origin_caution,
     shared_crossings,
 )
+from services.identification.bridge_remarks import bridge_remarks
 from services.identification.comparison import (
     CLEAR_LOSS,
     IMPLAUSIBLE_GAIN,
@@ -75,6 +76,7 @@ def cautions(measured: CautionBasis, language: Language) -> Iterator[str]:
     yield from _seasons(measured, language)
     yield from _combined(measured.combined, language)
     yield from _ends(measured, language)
+    yield from bridge_remarks(measured.crossings, language)
 
 
 def possibly_weak(view: BridgeView) -> tuple[Element, ...]:

@@ -48,7 +48,7 @@ from services.simulation.drive import (
 )
 from tests.builders.certificates import certificate
 from tests.identifications import identify_recordings
-from tests.unit.viewer.found import RATIOS, results_of, some_crossing
+from tests.unit.viewer.found import RATIOS, results_of, some_crossing, with_contradictions
 
 SOUND_NM2 = 1.56e10
 LEAST_SQUARES = IdentificationSettings(method="least_squares")
@@ -456,6 +456,17 @@ def test_single_crossing_has_the_finding_and_its_level_once(
         assert out.lower().count("overall stiffness") == 1
         assert "not resolved: EI_1 (standard deviation above 25 %)\n" in out
         assert "thirds of the bridge: 0.91" in out
+
+
+def test_contradiction_of_the_site_file_is_a_remark(capsys: pytest.CaptureFixture[str]) -> None:
+    site = paper_site()
+    found = results_of(site, some_crossing("a"))
+    _print(Console(width=80), found, site)
+    assert "remark" not in capsys.readouterr().out
+    _print(Console(width=80), with_contradictions(found, prior_z_rhoA=25.54), site)
+    out = capsys.readouterr().out
+    assert "\nverdict good\n" in out
+    assert "\nremark: The estimate of the mass per length (rhoA) is 7,335 kg/m, declared 4,4" in out
 
 
 def test_each_reason_is_followed_by_the_remedy_of_reports(

@@ -358,6 +358,11 @@ def test_results_are_short_in_a_notebook(
             solution.value["EI_4"], 15.6e9
         )
     assert "980 more crossings" in many._repr_html_()
+    mass = {"prior_z_rhoA": 25.5}
+    far = solution.crossing.model_copy(update={"diagnostics": mass})
+    assert (
+        "<li>The estimate of the mass per length" in solution._replace(crossing=far)._repr_html_()
+    )
     named = solution.crossing.model_copy(update={"vehicle": "<b>x</b>"})
     assert "<b>x" not in solution._replace(crossing=named)._repr_html_()
 

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pre_core import parameters
 from pre_core.crossing import posterior
 from services.identification import fit_reasons
-from services.identification.fit_reasons import _place_of_misfit, _wrong_bridge
+from services.identification.fit_reasons import _place_of_misfit, _wrong_bridge, contradictions
 
 
 @pytest.mark.parametrize(
@@ -42,3 +43,36 @@ def test_misfit_names_a_first_frequency_far_from_the_declared_one(
     seen = _wrong_bridge(data, found)
     expected = f"the estimated first frequency is {fitted_hz} Hz, declared {declared_hz} Hz, so"
     assert seen.startswith(expected) if is_named else seen == ""
+
+
+def test_bridge_parameter_beyond_four_priors_deviations_is_a_diagnostic(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Log-normal priors count in logarithms, half-normal ones from zero; EI has no remark."""
+    nominal = np.ones(parameters.EI_1 + 1)
+    spread = np.full(nominal.size, 0.1)
+    half_normal = np.zeros(nominal.size, dtype=bool)
+    half_normal[parameters.F : parameters.F + 2] = True
+    estimated = np.ones(nominal.size, dtype=bool)
+    estimated[parameters.TORSION] = False
+    theta = np.tile(nominal, (2, 1))
+    theta[:, parameters.RHO_A] = np.exp(-0.22 * np.array([9.0, 11.0]))
+    theta[:, parameters.ALPHA] = np.exp(0.39)
+    theta[:, parameters.F] = 0.41
+    theta[:, parameters.F + 1] = 0.39
+    theta[:, parameters.TORSION] = theta[:, parameters.EI_1] = 9.0
+    monkeypatch.setattr(posterior, "values_of", lambda *_: SimpleNamespace(theta=theta))
+    priors = SimpleNamespace(
+        theta=nominal, spread=spread, half_normal=half_normal, estimated=estimated
+    )
+    problem: Any = SimpleNamespace(priors=priors)
+
+    def found(f1_hz: float, declared_hz: float | None) -> dict[str, float]:
+        bridge: Any = SimpleNamespace(first_frequency_hz=declared_hz)
+        derived: Any = SimpleNamespace(f1_hz=SimpleNamespace(mean=f1_hz))
+        return contradictions(bridge, problem, np.zeros((1, 2, 1)), derived)
+
+    alone = found(5.1, None)
+    assert alone == pytest.approx({"prior_z_rhoA": -22.0, "prior_z_f_start": 4.1})
+    assert found(3.9, 3.3) == alone
+    assert found(5.1, 3.0) == pytest.approx(alone | {"f1_over_declared": 1.7})

@@ -17,18 +17,20 @@ from services.common.language import LANGUAGES, language_of
 from services.history.bridge_history import BridgeHistory, ElementChange, PeriodComparison
 from services.history.validation_files import save
 from services.history.watch_files import MonitoringState
+from services.identification.bridge_remarks import bridge_remarks
 from services.report.advice import next_steps
 from services.report.bridge import BridgeReport, bridge_reports
 from services.report.earlier import season_of
 from services.report.histories import with_history
 from services.report.page import page
+from services.simulation.drive import paper_site
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.drawing import STYLE
 from tests.builders.certificates import certificate
 from tests.unit.history.test_bridge_history import alarm
 from tests.unit.history.test_history_store import BEGIN_S
 from tests.unit.report.test_report import KNOWN, Seen, fused, reported, without_weak
-from tests.unit.viewer.found import RATIOS, results_of, some_crossing
+from tests.unit.viewer.found import RATIOS, results_of, some_crossing, with_contradictions
 
 GAP, OUTAGE = Reason.GAP_ON_BRIDGE, Reason.POSITION_OUTAGE
 HALF_YEAR_S = 182.0 * 86400.0
@@ -486,3 +488,32 @@ def test_figure_has_numbers_of_one_meaning(site: Site, then: Path, code: str) ->
         assert language.text(f"figure.numbers_{meaning}") in panel.get_title(loc="left")
         labels = [one.get_ylabel() for one in figure.axes]
         assert (language.text("figure.ratio") in labels) == (meaning == "ratio")
+
+
+def test_bridge_parameter_far_from_the_site_file_is_named(site: Site) -> None:
+    usual = results_of(site, some_crossing("a"), used="a")
+    assert "The estimate of" not in first_page(reported(site, usual))
+    far = with_contradictions(usual, prior_z_rhoA=25.54, f1_over_declared=1.25)
+    text = first_page(reported(site, far))
+    assert (
+        "The estimate of the mass per length (rhoA) is 7,335 kg/m, declared 4,400 kg/m: a "
+        "difference of 25.5 of the site file's standard deviations."
+    ) in text
+    assert "The estimate of the first frequency is 3.6 Hz, declared 2.88 Hz." in text
+    assert report_on(site, far).finding == report_on(site, usual).finding
+    (german,) = bridge_reports([(Path("a.json"), far, site)], None, language=language_of("de"))
+    assert any(
+        "die Masse pro Länge (rhoA) mit 7.335 kg/m, angegeben mit 4.400 kg/m: ein Unterschied von "
+        "25,5 Standardabweichungen" in caution
+        for caution in german.cautions
+    )
+
+
+def test_contradictions_of_several_crossings_are_one_caution() -> None:
+    site = paper_site()
+    far = with_contradictions(results_of(site, some_crossing("a"), some_crossing("b")))
+    one, other = far.crossings
+    worst = one.model_copy(update={"diagnostics": {"prior_z_rhoA": -5.0}})
+    (text,) = bridge_remarks([other, worst])
+    assert "is 7,335 kg/m in a crossing, declared 4,400 kg/m: a difference of 5.0 of" in text
+    assert "of more than 4 in 1 of 2 crossings" in text
