@@ -290,8 +290,6 @@ def _chosen(solution: Solution, names: Sequence[str] | None) -> list[str]:
     if names is not None:
         chosen = names_of("names", names)
     for name in chosen:
-        if name in solution.draws and name not in known:
-            raise InputError(f"{name}: has draws only, found.posterior() returns them")
         if name not in known:
             raise InputError(f"{name}: is unknown, it must be one of {', '.join(known)}")
     if not chosen:

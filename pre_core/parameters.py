@@ -128,6 +128,8 @@ SPRINGS: Final = ("suspension_stiffness_n_per_m", "suspension_damping_ns_per_m")
 of the front axle and of the tandem's axles together."""
 DERIVED_UNITS: Final = {"m_s": "kg", "m_s1": "kg", "m_s2": "kg"}
 """Units of the masses that are derived from parameters (`physics.models.body_masses`)."""
+PLACEMENT_UNITS: Final = {"wheelbase_m": "m", "position_offset_m": "m"}
+"""Units of the results of method `pre` beyond theta: wheelbase, and the receiver's slow error."""
 
 
 def index_of(name: str) -> int:
@@ -180,9 +182,10 @@ def names(elements: int, first_axle: int = 1) -> tuple[str, ...]:
 
 
 def unit(name: str) -> str:
-    """Return the SI unit of a parameter or derived mass; raise KeyError for unknown names."""
-    if name in DERIVED_UNITS:
-        return DERIVED_UNITS[name]
+    """Return the SI unit of a value of a result; raise KeyError for unknown names."""
+    beyond = DERIVED_UNITS | PLACEMENT_UNITS
+    if name in beyond:
+        return beyond[name]
     if name.startswith(f"{ELEMENT.name}_"):
         return ELEMENT.unit
     of_tandem = {row.name: row.unit for row in table(1, 2)}

@@ -15,7 +15,14 @@ from typing import Any, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from pre_core.parameters import DERIVED_UNITS, ELEMENT, SCALARS, TRUCK, ParameterSpec
+from pre_core.parameters import (
+    DERIVED_UNITS,
+    ELEMENT,
+    PLACEMENT_UNITS,
+    SCALARS,
+    TRUCK,
+    ParameterSpec,
+)
 from schemas import fusion, results, site, site_axle_tables, site_import, site_ros2, site_sensors
 from schemas.metrics import METRICS
 from schemas.reasons import BRIDGE_REASON_TEXTS, LEFT_OUT_TEXTS, LeftOutReason
@@ -297,9 +304,14 @@ def parameters() -> str:
     rows = [(f"`{p.name}`", p.unit, f"{_site_key(p)}{_which(p)}") for p in SCALARS]
     rows.append((f"`{ELEMENT.name}_1` …", ELEMENT.unit, f"`{ELEMENT.key}`"))
     rows += [(f"`{name}`", unit, "derived") for name, unit in DERIVED_UNITS.items()]
+    rows += [(f"`{name}`", unit, _PLACEMENT[name]) for name, unit in PLACEMENT_UNITS.items()]
     return _table(("name", "unit", "quantity"), rows)
 
 
+_PLACEMENT = {
+    "wheelbase_m": "`wheelbase_m`; of a tandem, distance of axles 2 and 3",
+    "position_offset_m": "slow error of the receiver",
+}
 _NOT_IN_SITE_FILE = {
     "support_rotational_stiffness_nm_per_rad": "rotational restraint",
     "support_compliance_m_per_n": "bearing compliance",

@@ -49,6 +49,7 @@ from services.identification.result_parts import (
     part_of_elements,
     rejected,
     road_result,
+    summary_of,
 )
 
 _FINITE_ELEMENTS, _FINITE_ELEMENTS_OF_SPAN = 14, 8
@@ -305,19 +306,20 @@ def _values(
     theta = at.theta * scale[:, None] ** parameters.mass_powers(data.bridge.elements)
     kept = np.flatnonzero(problem.priors.estimated)
     values = {
-        names[i]: _parameter(parameters.unit(names[i]), theta[:, i], _prior(problem, int(i)))
+        names[i]: summary_of(parameters.unit(names[i]), theta[:, i], _prior(problem, int(i)))
         for i in kept
     }
     behind_kg = data.vehicle.total_mass_kg - problem.crossing.lead.unsprung_mass_kg
     masses = body_masses(at.theta, behind_kg, data.vehicle.wheelbase_m)
     for k, name in enumerate(("m_s", "m_s1", "m_s2")):
-        values[name] = _parameter("kg", masses[:, k] * scale, None)
+        values[name] = summary_of("kg", masses[:, k] * scale, None)
+    offset_m = flat[:, posterior.layout(problem).offset]
+    of_wheelbase, of_offset = _placement_priors(problem)
+    values["wheelbase_m"] = summary_of("m", at.wheelbase_m, of_wheelbase)
+    values["position_offset_m"] = summary_of("m", offset_m, of_offset)
     covariance = np.cov(theta[:, kept].T)
     draws = {names[i]: theta[:, i] for i in kept}
-    draws |= {
-        "wheelbase_m": at.wheelbase_m,
-        "position_offset_m": flat[:, posterior.layout(problem).offset],
-    }
+    draws |= {"wheelbase_m": at.wheelbase_m, "position_offset_m": offset_m}
     steps, chains = chain.draws.shape[:2]
     keep(
         data.crossing_id,
@@ -335,19 +337,6 @@ def _values(
     }
 
 
-def _parameter(unit: str, draws: Floats, prior: results.Prior | None) -> results.Parameter:
-    low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975])
-    return results.Parameter(
-        unit=unit,
-        mean=float(draws.mean()),
-        std=float(draws.std()),
-        q025=float(low),
-        q50=float(middle),
-        q975=float(high),
-        prior=prior,
-    )
-
-
 def _prior(problem: posterior.PosteriorProblem, i: int) -> results.Prior:
     priors = problem.priors
     if priors.half_normal[i]:
@@ -359,6 +348,19 @@ def _prior(problem: posterior.PosteriorProblem, i: int) -> results.Prior:
         )
     return results.Prior(
         distribution="log_normal", location=float(priors.theta[i]), scale=float(priors.spread[i])
+    )
+
+
+def _placement_priors(problem: posterior.PosteriorProblem) -> tuple[results.Prior, results.Prior]:
+    """Return the priors of the wheelbase and of the receiver's slow error along the chainage."""
+    priors = problem.priors
+    return (
+        results.Prior(
+            distribution="log_normal", location=priors.wheelbase_m, scale=priors.wheelbase_spread
+        ),
+        results.Prior(
+            distribution="normal", location=0.0, scale=float(1.0 / problem.receiver_rows[-1, -1])
+        ),
     )
 
 
@@ -383,16 +385,16 @@ def _derived(
     few = _chosen(flat.shape[0], _DEFLECTION_DRAWS, rng)
     deflections = posterior.largest_deflections_m(problem, flat[few])
     return results.Derived(
-        f1_hz=_parameter("Hz", frequencies, None),
-        max_deflection_m=_parameter("m", deflections, None),
+        f1_hz=summary_of("Hz", frequencies, None),
+        max_deflection_m=summary_of("m", deflections, None),
         probability_sprung=_probability_of(theta, parameters.K_ROT),
         probability_giving=_probability_of(theta, parameters.F),
         probability_torsion=float((theta[:, parameters.TORSION] > 0.0).mean()),
         springs_believed=posterior.suspension_equation_weight(problem, flat.mean(axis=0)),
-        ei_level=_parameter("1", _level(data.bridge, scaled, 0.0, 1.0), None),
+        ei_level=summary_of("1", _level(data.bridge, scaled, 0.0, 1.0), None),
         ei_thirds=results.Thirds(
             **{
-                name: _parameter("1", _level(data.bridge, scaled, k / 3.0, (k + 1) / 3.0), None)
+                name: summary_of("1", _level(data.bridge, scaled, k / 3.0, (k + 1) / 3.0), None)
                 for k, name in enumerate(results.Thirds.model_fields)
             }
         ),

@@ -141,6 +141,20 @@ def beam_of(data: CrossingData, theta: Floats) -> Beam:
     return beam_from(theta, np.array(bridge.lengths_m), bridge.interior_support_nodes)
 
 
+def summary_of(unit: str, draws: Floats, prior: results.Prior | None) -> results.Parameter:
+    """Return a quantity's statistics over its draws (n,)."""
+    low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975])
+    return results.Parameter(
+        unit=unit,
+        mean=float(draws.mean()),
+        std=float(draws.std()),
+        q025=float(low),
+        q50=float(middle),
+        q975=float(high),
+        prior=prior,
+    )
+
+
 def gaussian(unit: str, mean: float, std: float) -> results.Parameter:
     """Return a quantity with a normal uncertainty."""
     return results.Parameter(

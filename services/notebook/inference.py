@@ -20,9 +20,8 @@ _SEED: Final = 1
 def prior_of(crossings: Sequence[CrossingResult]) -> "xr.Dataset":
     """Return draws of the priors as arrays (chain, draw, crossing), one chain of 2000.
 
-    The names are those of the posterior, without `wheelbase_m` and `position_offset_m`. Common
-    factors of mass and gain are not in the draws. A prior with a spike gives zeros, so results of
-    older programs, which do not name it, give none.
+    The names are those of the posterior. Common factors of mass and gain are not in the draws. A
+    prior with a spike gives zeros, so results of older programs, which do not name it, give none.
     """
     rng = np.random.default_rng(_SEED)
     drawn = []

@@ -144,8 +144,7 @@ class Identification(NamedTuple):
     def prior(self) -> "xr.Dataset":
         """Return draws of the priors, named as the posterior's; needs xarray.
 
-        `wheelbase_m` and `position_offset_m` are missing: results do not contain their priors.
-        Springs, compliances and, without a declared lane, torsion are zero with a probability of
+        Restraint, compliance and, without a declared lane, torsion are zero with a probability of
         one half (`probability_zero`), in these draws, too.
         """
         return prior_of([solution.crossing for solution in self.solutions if solution.draws])
