@@ -58,6 +58,7 @@ from services.identification.bridge_remarks import bridge_remarks
 from services.identification.bridge_state import FusionSettings
 from services.identification.methods import lacks_noise
 from services.ledger.baselines import Baselines, baselines_of, realms_of_bridges
+from services.notebook.inference import groups_beside
 from services.recordings.recording import read_messages
 from services.recordings.remote import Source, all_fetched, is_folder_of_recordings
 
@@ -103,11 +104,11 @@ def identify_command(
         line = f"{count_of(len(written), 'picture')} in {asked.figures}"
         console.print(line, highlight=False, soft_wrap=True)
     if asked.draws is not None:
+        drawn = [crossing for crossing in found.crossings if crossing.crossing_id in draws]
         kept = (
-            DrawsOfCrossing(c.crossing_id, c.vehicle, c.bridge, draws.get(c.crossing_id, {}))
-            for c in found.crossings
+            DrawsOfCrossing(c.crossing_id, c.vehicle, c.bridge, draws[c.crossing_id]) for c in drawn
         )
-        write_draws(asked.draws, kept)
+        write_draws(asked.draws, kept, groups_beside(asked.draws, drawn))
     return 0
 
 

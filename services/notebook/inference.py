@@ -1,6 +1,7 @@
 """Prior draws and diagnostics of crossings, with their posterior draws, as ArviZ groups them."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -32,6 +33,13 @@ def prior_of(crossings: Sequence[CrossingResult]) -> "xr.Dataset":
             DrawsOfCrossing(crossing.crossing_id, crossing.vehicle, crossing.bridge, draws)
         )
     return posterior(drawn)
+
+
+def groups_beside(path: Path, crossings: Sequence[CrossingResult]) -> "dict[str, xr.Dataset]":
+    """Return the groups of a file of draws beyond the posterior's; none in a `.npz`."""
+    if path.suffix != ".nc" or not crossings:
+        return {}
+    return {"prior": prior_of(crossings), "sample_stats": statistics_of(crossings)}
 
 
 def prior_draws(prior: Prior) -> Floats:

@@ -24,7 +24,7 @@ from services.history.draws import (
     write_draws,
 )
 from services.notebook.arguments import file_of, wrong
-from services.notebook.inference import prior_of, statistics_of
+from services.notebook.inference import groups_beside, prior_of
 from services.notebook.showing import MAX_SHOWN, all_as_html, as_html, counted, one_line
 
 if TYPE_CHECKING:
@@ -160,10 +160,7 @@ class Identification(NamedTuple):
         file = file_of(path)
         check_draws_file(file)
         some = _with_draws(self.solutions, f"{file}: ")
-        groups = {}
-        if file.suffix == ".nc":
-            crossings = [solution.crossing for solution in some]
-            groups = {"prior": prior_of(crossings), "sample_stats": statistics_of(crossings)}
+        groups = groups_beside(file, [solution.crossing for solution in some])
         write_draws(file, (_draws_of(solution) for solution in some), groups)
 
     def to_json(self, path: str | Path) -> None:

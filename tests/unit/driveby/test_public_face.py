@@ -329,9 +329,11 @@ def test_the_command_line_says_the_same(
     assert mine == theirs
     import arviz
 
-    first, second = (arviz.from_netcdf(path).posterior for path in paths[2:])
-    assert first.equals(second)
-    assert first.equals(found.posterior())
+    first, second = (arviz.from_netcdf(path) for path in paths[2:])
+    assert first.groups() == second.groups() == ["posterior", "sample_stats", "prior"]
+    assert first.prior.equals(second.prior)
+    assert first.posterior.equals(second.posterior)
+    assert first.posterior.equals(found.posterior())
 
 
 def as_in_the_terminal(found: Parameter | ElementState, nominal: float) -> list[str]:
