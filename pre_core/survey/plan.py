@@ -13,7 +13,7 @@ values has to add it.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,9 @@ from pre_core.fusion.path_groups import low_rank_root
 from pre_core.search import levenberg_marquardt
 from pre_core.search.loop import Termination
 
-_DRAWS, _CHAINS = 1000, 2
-"""Number of draws, which give a standard deviation to 2 %, and of chains."""
+DRAWS: Final = 2000
+"""Number of draws of a forecast, which give a standard deviation to 2 % of itself."""
+_CHAINS = 2
 _SEED = 1
 
 
@@ -181,7 +182,7 @@ def survey_spreads(
         known.log_odds,
         truth[elements],
     )
-    drawn = np.concatenate([draws(of, _DRAWS, _SEED, chain) for chain in range(_CHAINS)])
+    drawn = np.concatenate([draws(of, DRAWS // _CHAINS, _SEED, chain) for chain in range(_CHAINS)])
     ln_ei = drawn[:, elements] * known.sigma
     return SurveySpreads(ln_ei.std(axis=0), float((ln_ei @ lengths_m / lengths_m.sum()).std()))
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from pre_core.constants import DETECTION_PROBABILITY
 from pre_core.survey.detection import FALSE_ALARM
+from pre_core.survey.plan import DRAWS
 from services.common.naming import count_of
 from services.common.road_class import assumed_road
 from services.identification.comparison import CLEAR_LOSS
@@ -28,6 +29,7 @@ def as_json(found: SurveyForecast) -> dict[str, Any]:
         "loss": found.question.loss,
         "false_alarm": FALSE_ALARM,
         "sure": DETECTION_PROBABILITY,
+        "draws": DRAWS,
         "crossings": found.question.crossings,
         "speed_m_per_s": found.question.speed_m_per_s,
         "road_class": found.road.road_class,
@@ -113,6 +115,7 @@ def _legend_of_elements(crossings: int) -> Iterator[str]:
     """Yield a line for each column of the first table, and how to read all of them."""
     wanted = percent(DETECTION_PROBABILITY)
     yield "±          standard deviation of EI; near 55 % the measurement adds nothing"
+    yield f"           (from {DRAWS:,} draws, which give it to 2 % of itself)"
     yield "seen       probability that the loss is detected against the nominal value"
     yield "vs others  probability that the loss is detected against the other elements"
     yield f"smallest   smallest loss that is detected with {wanted} probability"

@@ -13,7 +13,7 @@ from services.common.truck_choice import truck_to_try
 from services.planning.advice import advice
 from services.planning.alternatives import TANDEM, as_planned, with_noise
 from services.planning.crossings import PlannedRoad
-from services.planning.forecast_text import lines_of
+from services.planning.forecast_text import as_json, lines_of
 from services.planning.survey import (
     PlanForecast,
     SpeedForecast,
@@ -218,3 +218,9 @@ def test_tandem_that_does_not_help_is_not_advised() -> None:
 def test_legend_says_why_equal_deviations_are_seen_unequally() -> None:
     text = " ".join(lines_of(forecast((9, 40, 0.2))))
     assert "Next to supports, whose restraint is unknown, less is seen" in text
+
+
+def test_forecast_states_the_draws_behind_its_deviations() -> None:
+    found = forecast((9, 40, 0.2))
+    assert "(from 2,000 draws, which give it to 2 % of itself)" in " ".join(lines_of(found))
+    assert as_json(found)["draws"] == 2000
