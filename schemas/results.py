@@ -128,7 +128,8 @@ class RoadResult(StrictModel):
     std_m: tuple[Finite, ...] | None = None
     """Standard deviation of the error of `mean_m` without offset, tilt and bend, that is of the
     error less its least-squares parabola over `x_m`. Twice integrated accelerations do not
-    determine the bend, and no spread covers it. None without a noise model."""
+    determine the bend, and no spread covers it; nor does it cover waves below a metre at more than
+    10 m/s, which are interpolated between samples. None without a noise model."""
     iri_m_per_km: Finite | None = None
     iso_class: str | None = None
     mismatch: RoadMismatch | None = None
