@@ -13,8 +13,9 @@ from pydantic import BaseModel, Field
 from schemas.site_errors import error_at
 from schemas.site_numbers import Number
 
-_KEYS: Final = ("damping_ratio", "first_frequency_hz")
-_COEFFICIENTS: Final = ("rayleigh_alpha_per_s", "rayleigh_beta_s")
+DAMPING_RATIO: Final = "damping_ratio"
+_KEYS: Final = (DAMPING_RATIO, "first_frequency_hz")
+COEFFICIENTS: Final = ("rayleigh_alpha_per_s", "rayleigh_beta_s")
 _MASS_AND_SPAN: Final = ("mass_per_length_kg_per_m", "span_m")
 _SECOND: Final = 4.0
 """Ratio of the second natural frequency to the first."""
@@ -48,7 +49,7 @@ def with_coefficients(table: Any) -> Any:
     """
     if not isinstance(table, dict) or not any(key in table for key in _KEYS):
         return table
-    for key in _COEFFICIENTS:
+    for key in COEFFICIENTS:
         if key in table:
             raise error_at(key, f"is given together with {_KEYS[0]}, remove one of them")
     for key, other in zip(_KEYS, reversed(_KEYS), strict=True):
@@ -60,10 +61,10 @@ def with_coefficients(table: Any) -> Any:
         isinstance(value, int | float) and not isinstance(value, bool) and 0.0 < value <= most
         for value, most in zip(values, limits, strict=True)
     ):
-        return table | dict.fromkeys(_COEFFICIENTS, 0.0)
+        return table | dict.fromkeys(COEFFICIENTS, 0.0)
     _check_frequency(table, values[1])
     rest = {key: value for key, value in table.items() if key != _KEYS[0]}
-    return rest | dict(zip(_COEFFICIENTS, rayleigh_of(*values), strict=True))
+    return rest | dict(zip(COEFFICIENTS, rayleigh_of(*values), strict=True))
 
 
 def _single_span_frequency_hz(table: dict[str, Any]) -> float | None:

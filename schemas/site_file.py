@@ -12,6 +12,7 @@ from schemas.errors import InputError
 from schemas.site import MAX_TABLES, Bridge, Receiver, Sensor, Site, Vehicle
 from schemas.site_axle_tables import Axle, Bogie
 from schemas.site_bridge import MAX_ELEMENTS
+from schemas.site_damping import COEFFICIENTS, DAMPING_RATIO
 from schemas.site_errors import Tables, all_lines, first_line
 from schemas.site_import import Import
 from schemas.site_ros2 import Ros2
@@ -60,8 +61,9 @@ def with_values(site: Site, values: Mapping[str, object]) -> Site:
 
     Nominal values and spreads are the priors of the parameters. Where the site has several vehicles
     or bridges, the identifier takes the place of the table's name. None removes a key, so that its
-    default applies; a key without a default is missing then. Raise InputError in one line for a
-    name or value that a site file must not have.
+    default applies; a key without a default is missing then. `damping_ratio` with
+    `first_frequency_hz` replaces the Rayleigh coefficients. Raise InputError in one line for a name
+    or value that a site file must not have.
     """
     if not isinstance(site, Site):
         raise InputError(
@@ -90,6 +92,9 @@ def with_values(site: Site, values: Mapping[str, object]) -> Site:
             table.pop(key, None)
         else:  # an unknown key is refused with its table, whatever its value
             table[key] = list(plain) if isinstance(plain, tuple) else plain
+        for replaced in COEFFICIENTS if key == DAMPING_RATIO and plain is not None else ():
+            if f"{of}.{replaced}" not in values:
+                table.pop(replaced, None)
     return _site_of(tables, "the site")
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from schemas.errors import InputError
 from schemas.signals import MAX_RATE_HZ
 from schemas.site import Bridge, Site
+from schemas.site_damping import rayleigh_of
 from schemas.site_file import (
     load_site,
     parse_site,
@@ -600,3 +601,16 @@ def test_densities_are_a_number_or_a_list_of_four() -> None:
     site = parse_site(TEXT, "site.toml")
     with pytest.raises(InputError, match=r'is "25", it must be a number, or a list of four in'):
         with_values(site, {"sensor.noise_density_ug_per_rthz": "25"})
+
+
+def test_damping_ratio_replaces_the_coefficients_of_a_loaded_site() -> None:
+    """Its two keys suffice: the coefficients are what a site keeps of them."""
+    site = load_site(EXAMPLE)
+    values = {"bridge.damping_ratio": 0.02, "bridge.first_frequency_hz": 3.0}
+    (bridge,) = with_values(site, values).bridges
+    alpha, beta = rayleigh_of(0.02, 3.0)
+    assert (bridge.rayleigh_alpha_per_s, bridge.rayleigh_beta_s) == (alpha, beta)
+    with pytest.raises(InputError, match="given together with damping_ratio"):
+        with_values(site, {**values, "bridge.rayleigh_beta_s": 1e-3})
+    with pytest.raises(InputError, match="first_frequency_hz is missing"):
+        with_values(site, {"bridge.damping_ratio": 0.02})
