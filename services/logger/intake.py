@@ -21,6 +21,7 @@ from services.common.intervals import Intervals
 from services.common.naming import count_of
 from services.logger.clock_watch import ClockWatch
 from services.logger.known_streams import StreamCache, StreamRecord
+from services.logger.shared_names import SharedNames
 
 GAP_PATIENCE_S = 5.0
 """Time to fetch a missing message before a gap is recorded."""
@@ -67,6 +68,7 @@ class Intake:
     settled: list[tuple[Key, int, int, int]] = field(default_factory=list)
     """Stream, boot, first and last of messages that will never be written; the caller empties it.
     """
+    shared_names: SharedNames = field(default_factory=SharedNames)
     _streams: StreamCache = field(init=False)
     _clocks: ClockWatch = field(default_factory=ClockWatch)
     _refused: dict[str, Refusals] = field(default_factory=dict)
@@ -114,6 +116,7 @@ class Intake:
         self.counts["accepted"] += 1
         if not received.recovered:
             self._clocks.note(where, identity, stamp, now_ns)
+            self.shared_names.note(where, identity.boot_id, now_ns)
         return Message(where, received.payload, *identity, stamp.wall_time_ns, now_ns)
 
     def adopt(self, where: Key, boot_id: int, first: int, last: int, now_ns: int) -> bool:
@@ -185,6 +188,7 @@ class Intake:
             memory.pop(name, None)
         self.forgotten.append(name)
         self._clocks.forget(where, boot_id)
+        self.shared_names.forget(where, boot_id)
 
     def _is_new(self, where: Key, identity: Identity, stream: StreamRecord, payload: bytes) -> bool:
         name = (where, identity.boot_id)

@@ -247,6 +247,9 @@ def _report(logger: _Logger, announcements: "_Announcements", *, closing: bool) 
     now_ns = time.time_ns()
     for where, event in logger.intake.report(now_ns, time.monotonic(), closing=closing):
         announcements.event(where.realm, event)
+    for sender, line in logger.intake.shared_names.news():
+        fields = about(realm=sender.realm, **{sender.owner: sender.identifier})
+        _log.warning("%s", line, extra=fields)
     announcements.report_drops(now_ns, closing=closing)
 
 
@@ -370,7 +373,8 @@ class _Announcements:
         if writer.room.free_bytes is not None:
             figures["disk_free_bytes"] = writer.room.free_bytes
         figures |= self._completeness.figures()
-        notes = (writer.failure or "", self._unlisted.note, clock_note(figures))
+        shared = self._logger.intake.shared_names.note_text(time.time_ns())
+        notes = (writer.failure or "", self._unlisted.note, clock_note(figures), shared)
         message = pb.Health(
             schema_version=1,
             time_ns=time.time_ns(),

@@ -1,15 +1,15 @@
 """Listing of the spools of all trucks, requested at once.
 
 Answers are read and decoded in a thread of their own, because a truck may list thousands of boots
-and answer a query any number of times. In each round only each stream's first answer counts, bytes
-per vehicle are limited, and the queue is bounded.
+and answer a query any number of times. In each round only a few answers for a stream count, from
+trucks that share a name by mistake; bytes per vehicle are limited, and the queue is bounded.
 """
 
 import logging
 import threading
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import zenoh
 from zenoh import handlers
@@ -27,6 +27,18 @@ _REPLIES_WAITING = 200
 """Capacity for unread answers before the bus blocks others."""
 _MAX_BYTES = 1 << 20
 """Largest answer of one vehicle in one round; 10,000 ranges take a sixth of it."""
+SHARERS = 4
+"""Largest number of trucks of one name whose spools are read."""
+
+
+class SpoolListed(NamedTuple):
+    """The answers of one round for one stream."""
+
+    where: Key
+    boots: list[SpoolBoot]
+    """Contents, oldest boot first."""
+    is_shared: bool
+    """Whether several trucks of this name have answered, so that none lists all boots."""
 
 
 class SpoolListing:
@@ -38,7 +50,7 @@ class SpoolListing:
         self._bus = bus
         self._realms = realms
         self._complaints = complaints
-        self._answers: dict[Key, list[SpoolBoot]] = {}
+        self._answers: dict[Key, SpoolListed] = {}
         self._lock = threading.Lock()
         self._is_over = threading.Event()
         """Set when the round that is going on is to end, each round having its own."""
@@ -53,13 +65,12 @@ class SpoolListing:
         )
         self._thread.start()
 
-    def next_answer(self) -> tuple[Key, list[SpoolBoot]] | None:
-        """Return a truck's contents of a stream, oldest boot first; None if there is no news."""
+    def next_answer(self) -> SpoolListed | None:
+        """Return the contents of a stream; None if there is no news."""
         with self._lock:
             if not self._answers:
                 return None
-            where = next(iter(self._answers))
-            return where, self._answers.pop(where)
+            return self._answers.pop(next(iter(self._answers)))
 
     def close(self) -> None:
         """Stop all queries."""
@@ -73,7 +84,7 @@ class SpoolListing:
         except zenoh.ZError as error:  # the session is closing
             _log.debug("spool query: %s", error)
             return
-        read: set[Key] = set()
+        read: dict[Key, dict[bytes, list[SpoolBoot]]] = {}
         sizes: Counter[str] = Counter()
         while listings and not is_over.is_set():
             is_idle = True
@@ -99,19 +110,29 @@ class SpoolListing:
             timeout=_TIMEOUT_S,
         )
 
-    def _read(self, sample: zenoh.Sample, read: set[Key], sizes: Counter[str]) -> None:
+    def _read(
+        self,
+        sample: zenoh.Sample,
+        read: dict[Key, dict[bytes, list[SpoolBoot]]],
+        sizes: Counter[str],
+    ) -> None:
         try:
             where = parse_spool_key(str(sample.key_expr))
-            if where in read:
+            answers = read.setdefault(where, {})
+            payload = sample.payload.to_bytes()
+            if payload in answers or len(answers) >= SHARERS:
                 raise ValueError(f"{where.identifier} answers more than once for {where.stream}")
-            read.add(where)
-            size = len(sample.payload)
-            sizes[where.identifier] += size
+            answers[payload] = []  # a malformed one counts as well
+            sizes[where.identifier] += len(payload)
             if sizes[where.identifier] > _MAX_BYTES:
                 raise ValueError(f"{where.identifier} lists more than {_MAX_BYTES} bytes")
-            boots = decode_contents(sample.payload.to_bytes())
+            boots = decode_contents(payload)
         except ValueError as error:
             self._complaints.warn("spool contents", "spool contents: %s", error)
             return
+        answers[payload] = boots
+        merged = {boot.boot_id: boot for one in reversed(answers.values()) for boot in one}
+        listed = [merged[boot_id] for boot_id in sorted(merged)]
+        is_shared = sum(map(bool, answers.values())) > 1
         with self._lock:
-            self._answers[where] = boots
+            self._answers[where] = SpoolListed(where, listed, is_shared)

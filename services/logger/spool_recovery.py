@@ -36,8 +36,9 @@ from schemas.spool import (
 from schemas.topics import Key, key
 from services.bus.subscription import RawSample, SeenSequences
 from services.common.intervals import Intervals
+from services.common.log_lines import about
 from services.logger.rate_limited_log import RateLimitedLog
-from services.logger.spool_listing import SpoolListing
+from services.logger.spool_listing import SHARERS, SpoolListed, SpoolListing
 
 __all__ = ["Shortfall", "SpoolRecovery", "shortfall"]
 
@@ -110,14 +111,18 @@ class _Task:
     handler: Any
     deadline_s: float
     got: Intervals = field(default_factory=Intervals)
+    next_sequence: int | None = None
+    """Where the page continues."""
+    is_ended: bool = False
+    """Whether a closing page has come."""
     replies: int = 0
     bytes: int = 0
 
 
 @dataclass
 class _Truck:
-    ripe: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Newest boot of each stream, and the sequence below which all are at least a round old."""
+    ripe: dict[str, dict[int, int]] = field(default_factory=dict)
+    """Sequence below which all are at least a round old, by stream and newest boot."""
     turn: Counter[str] = field(default_factory=Counter)
     """Number of earlier boots of each stream that have had their turn."""
     unlisted: set[tuple[Key, int]] = field(default_factory=set)
@@ -125,6 +130,8 @@ class _Truck:
     task: _Task | None = None
     failures: int = 0
     not_before_s: float = 0.0
+    is_shared: bool = False
+    """Whether trucks of the same name have answered: what one does not list, another may have."""
 
 
 class SpoolRecovery:
@@ -166,7 +173,7 @@ class SpoolRecovery:
             self._complaints.flush()
         began_s = time.monotonic()
         while time.monotonic() - began_s < _COMPARE_S and (answer := self._listing.next_answer()):
-            self._compare(*answer)
+            self._compare(answer)
         if not self._busy:
             return []
         received: list[RawSample] = []
@@ -200,33 +207,36 @@ class SpoolRecovery:
         """Pause a truck, longer each time, because there was no room for its messages."""
         truck = self._trucks.get((where.realm, where.identifier))
         if truck is not None and now_s >= truck.not_before_s:
-            self._pause(truck, now_s)
+            _pause(truck, now_s)
 
     def close(self) -> None:
         """Stop all queries."""
         self._listing.close()
         self._complaints.flush(closing=True)
 
-    def _compare(self, where: Key, boots: list[SpoolBoot]) -> None:
+    def _compare(self, answer: SpoolListed) -> None:
+        where, boots, is_shared = answer
         truck = self._truck(where)
         if truck is None or not boots:
             return
+        if is_shared:
+            _note_shared(truck, where)
         listed = {boot.boot_id for boot in boots}
         newest = boots[-1].boot_id
-        turn = self._turn(truck, where.stream, boots)
+        turn = _turn(truck, where.stream, boots)
         taken = {boot.boot_id for boot in turn}
         todo = deque(
             (key_, query)
             for key_, query in truck.todo
             if key_ != where or (query.boot_id in listed and query.boot_id not in taken)
         )
-        ripe_boot, ripe = truck.ripe.get(where.stream, (newest, 0))
+        ripe = truck.ripe.setdefault(where.stream, {})
         for boot in turn:
             seen = self._seen.streams.get((where, boot.boot_id), Intervals())
             # A message just sent may still arrive; an earlier boot sends nothing.
             below = boot.next_sequence
             if boot.boot_id == newest:
-                below = ripe if ripe_boot == newest else 0
+                below = ripe.get(newest, 0)
             gone = self._gone.get((where, boot.boot_id))
             missing = shortfall(boot, seen, below, () if gone is None else gone.ranges())
             for first, last in missing.confirmed:
@@ -237,10 +247,14 @@ class SpoolRecovery:
                 query = (where, SpoolQuery(boot.boot_id, first, last))
                 if query not in _under_way(truck):
                     todo.append(query)
-        truck.ripe[where.stream] = (newest, boots[-1].next_sequence)
+        ripe.pop(newest, None)
+        ripe[newest] = boots[-1].next_sequence
+        while len(ripe) > SHARERS:
+            del ripe[next(iter(ripe))]
         truck.todo = deque(islice(todo, MAX_RANGES))
         self._busy = self._busy or bool(todo)
-        self._forgotten(truck, where, listed, newest)
+        if not truck.is_shared:
+            self._forgotten(truck, where, listed, newest)
 
     def _truck(self, where: Key) -> _Truck | None:
         name = (where.realm, where.identifier)
@@ -262,15 +276,6 @@ class SpoolRecovery:
             truck = self._trucks[name] = _Truck()
             self._trucks_of[where.identifier] += 1
         return truck
-
-    def _turn(self, truck: _Truck, stream: str, boots: list[SpoolBoot]) -> list[SpoolBoot]:
-        """Return the boots to compare now: the newest one, and others in turn."""
-        earlier = boots[:-1]
-        if len(earlier) > _BOOTS_AT_ONCE:
-            first = truck.turn[stream] % len(earlier)
-            truck.turn[stream] = first + _BOOTS_AT_ONCE
-            earlier = (earlier + earlier)[first : first + _BOOTS_AT_ONCE]
-        return [*earlier, boots[-1]]
 
     def _forgotten(self, truck: _Truck, where: Key, listed: set[int], newest: int) -> None:
         """Give up the gaps of earlier boots that the truck has not listed for two rounds."""
@@ -312,7 +317,7 @@ class SpoolRecovery:
             )
         except zenoh.ZError as error:
             _log.debug("spool query: %s", error)
-            self._pause(truck, now_s)
+            _pause(truck, now_s)
             return
         truck.task = _Task(where, query, handler, now_s + 2 * _PAGE_TIMEOUT_S)
 
@@ -320,12 +325,15 @@ class SpoolRecovery:
         for _ in range(_REPLIES_PER_STEP):
             try:
                 reply = task.handler.try_recv()
-            except zenoh.ZError:  # ended without the closing page
-                self._failed(truck, task, now_s)
+            except zenoh.ZError:  # all have answered
+                if task.is_ended:
+                    self._page_complete(truck, task)
+                else:
+                    _failed(truck, task, now_s)
                 return
             if reply is None:
                 if now_s >= task.deadline_s:
-                    self._failed(truck, task, now_s)
+                    _failed(truck, task, now_s)
                 return
             task.replies += 1
             task.bytes += 0 if reply.ok is None else len(reply.ok.payload)
@@ -333,7 +341,7 @@ class SpoolRecovery:
                 self._complaints.warn(
                     "long pages", "%s: spool: a page without end", task.where.identifier
                 )
-                self._failed(truck, task, now_s)  # waiting answers are dropped with the handler
+                _failed(truck, task, now_s)  # waiting answers are dropped with the handler
                 return
             if reply.ok is None:
                 continue
@@ -342,8 +350,10 @@ class SpoolRecovery:
             payload = sample.payload.to_bytes()
             try:
                 if attachment is None:
-                    self._page_complete(truck, task, decode_page(payload, task.query))
-                    return
+                    if _is_complete(task, decode_page(payload, task.query)):
+                        self._page_complete(truck, task)
+                        return
+                    continue
                 identity = decode_identity(attachment)
             except ValueError as error:
                 self._complaints.warn("spool", "%s: spool: %s", task.where.identifier, error)
@@ -355,28 +365,61 @@ class SpoolRecovery:
                 if seen is None or identity.sequence not in seen:
                     received.append(RawSample(key(*task.where), payload, attachment, True, True))
 
-    def _page_complete(self, truck: _Truck, task: _Task, next_sequence: int | None) -> None:
+    def _page_complete(self, truck: _Truck, task: _Task) -> None:
         truck.task = None
         truck.failures = 0
         where, (boot_id, first, last) = task.where, task.query
-        if next_sequence is not None:
-            truck.todo.appendleft((where, SpoolQuery(boot_id, next_sequence, last)))
-            last = next_sequence - 1
+        if task.next_sequence is not None:
+            truck.todo.appendleft((where, SpoolQuery(boot_id, task.next_sequence, last)))
+            last = task.next_sequence - 1
+        if truck.is_shared:
+            return  # the truck that has them may not have answered
         seen = self._seen.streams.get((where, boot_id), Intervals())
         # Listed, but no longer readable: a damaged disk.
         for gap in task.got.missing_of([(first, last)]):
             for a, b in seen.missing_of([gap]):
                 self._lost(where, boot_id, a, b)
 
-    def _failed(self, truck: _Truck, task: _Task, now_s: float) -> None:
-        truck.task = None
-        truck.todo.appendleft((task.where, task.query))
-        self._pause(truck, now_s)
 
-    def _pause(self, truck: _Truck, now_s: float) -> None:
-        pause_s = min(_LONGEST_PAUSE_S, _FIRST_PAUSE_S * 2.0**truck.failures)
-        truck.failures = min(truck.failures + 1, 10)
-        truck.not_before_s = now_s + pause_s
+def _turn(truck: _Truck, stream: str, boots: list[SpoolBoot]) -> list[SpoolBoot]:
+    """Return the boots to compare now: the newest one, and others in turn."""
+    earlier = boots[:-1]
+    if len(earlier) > _BOOTS_AT_ONCE:
+        first = truck.turn[stream] % len(earlier)
+        truck.turn[stream] = first + _BOOTS_AT_ONCE
+        earlier = (earlier + earlier)[first : first + _BOOTS_AT_ONCE]
+    return [*earlier, boots[-1]]
+
+
+def _failed(truck: _Truck, task: _Task, now_s: float) -> None:
+    truck.task = None
+    truck.todo.appendleft((task.where, task.query))
+    _pause(truck, now_s)
+
+
+def _pause(truck: _Truck, now_s: float) -> None:
+    pause_s = min(_LONGEST_PAUSE_S, _FIRST_PAUSE_S * 2.0**truck.failures)
+    truck.failures = min(truck.failures + 1, 10)
+    truck.not_before_s = now_s + pause_s
+
+
+def _note_shared(truck: _Truck, where: Key) -> None:
+    if truck.is_shared:
+        return
+    truck.is_shared = True
+    _log.warning(
+        "several trucks in realm %s are named %s; all their spools are read, but give each truck "
+        "an id of its own",
+        where.realm, where.identifier, extra=about(realm=where.realm, vehicle=where.identifier),
+    )  # fmt: skip
+
+
+def _is_complete(task: _Task, next_sequence: int | None) -> bool:
+    """Note a closing page; return whether no other truck of this name may send more of it."""
+    task.is_ended = True
+    task.next_sequence = task.next_sequence if next_sequence is None else next_sequence
+    last = task.query.last if task.next_sequence is None else task.next_sequence - 1
+    return not task.got.missing_of([(task.query.first, last)])
 
 
 def _under_way(truck: _Truck) -> list[tuple[Key, SpoolQuery]]:

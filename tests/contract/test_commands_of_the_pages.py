@@ -186,7 +186,6 @@ NOT_RUN = {
     "python -m tests.mutants.run --help": "tests/mutants/test_mutants.py reads its options",
     "python -m tests.benchmarks.logger_load": LONG,
     "python -m tests.benchmarks.logger_load --trucks 100 --seconds 300": LONG,
-    "python -m tests.benchmarks.recordings": LONG,
     "python -m tests.benchmarks.replay_speed": LONG,
     "python -m tests.benchmarks.view": LONG,
     "python -m tests.screenshots": "tests/unit/viewer/test_screenshots.py takes them",

@@ -481,3 +481,24 @@ def test_what_is_recovered_while_it_is_about_to_be_read_is_known_too(
     found = sorted(known_on_disk(tmp_path, ["*"], time.time()))
     assert found == [(GNSS, 1, 0, 9), (GNSS, 1, 10, 19)]
     assert logged == []
+
+
+def test_second_truck_of_one_name_is_reported_and_kept() -> None:
+    intake = make()
+    written = [
+        intake.accept(message(n, boot_id=boot_id, wall_ns=NOW_NS + n * S), NOW_NS + n * S)
+        for n in range(30)
+        for boot_id in (1, 2)
+    ]
+    assert None not in written
+    [(sender, line)] = intake.shared_names.news()
+    assert sender.identifier == "truck-1"
+    assert "several trucks" in line
+
+
+def test_messages_fetched_from_an_earlier_boot_share_no_name() -> None:
+    intake = make()
+    for n in range(30):
+        intake.accept(message(n, boot_id=2, wall_ns=NOW_NS + n * S), NOW_NS + n * S)
+        intake.accept(message(n, boot_id=1, recovered=True), NOW_NS + n * S)
+    assert intake.shared_names.news() == []

@@ -21,6 +21,7 @@ from schemas.topics import Key
 from services.bus.subscription import RawSample, SeenSequences
 from services.common.intervals import Intervals
 from services.logger import spool_listing, spool_recovery
+from services.logger.spool_listing import SpoolListed
 from services.logger.spool_recovery import SpoolRecovery, shortfall
 from services.truck.gateway import Gateway
 from services.truck.spool import Spool
@@ -204,6 +205,28 @@ def test_recent_messages_are_not_requested(
     logger.run(lambda: len(logger.received) == 10)
     assert len(rounds) > 1
     gateway.close()
+
+
+def test_two_trucks_of_one_name_lose_nothing_and_are_reported(
+    router: zenoh.Session, client: zenoh.Session, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    spools = [Spool(tmp_path / name) for name in "ab"]
+    boots = [spool.boot_id for spool in spools]
+    trucks = [Gateway(client, "live", "truck-1", spool) for spool in spools]
+    for truck, batches in zip(trucks, (1200, 300), strict=True):
+        drive(truck, batches)
+    logger = Logger(router)
+    for boot_id in boots:  # gaps, which a truck that does not list the boot would give up
+        logger.seen.add(ACCEL, Identity(boot_id, 5))
+    logger.run(lambda: len(logger.received) + len(logger.lost) >= 1498)
+    assert not logger.lost
+    assert logger.numbers(boots[0]) == [n for n in range(1200) if n != 5]
+    assert logger.numbers(boots[1]) == [n for n in range(300) if n != 5]
+    [line] = [r.getMessage() for r in caplog.records if "several trucks" in r.getMessage()]
+    assert "realm live" in line
+    assert "truck-1" in line
+    for truck in trucks:
+        truck.close()
 
 
 def test_what_no_one_has_is_lost_and_what_was_confirmed_is_not(
@@ -454,9 +477,9 @@ def test_a_truck_in_many_realms_leaves_room_for_the_others(router: zenoh.Session
     boots = [SpoolBoot(1, 10, [(0, 9)], 9, 0)]
     for number in range(2000):
         where = ACCEL._replace(realm=f"sim-{number}", identifier="truck-evil")
-        logger.recovery._compare(where, boots)
+        logger.recovery._compare(SpoolListed(where, boots, False))
     for _ in range(2):  # what is new is compared in the second round
-        logger.recovery._compare(ACCEL, boots)
+        logger.recovery._compare(SpoolListed(ACCEL, boots, False))
     assert len(logger.recovery._trucks) == spool_recovery.REALMS_OF_ONE + 1
     assert logger.confirmed == set(range(10))
 
@@ -469,7 +492,7 @@ def test_a_boot_that_is_gone_from_disk_and_truck_is_lost(router: zenoh.Session) 
     boots = [SpoolBoot(2, 7, [(6, 6)], 6, 0), SpoolBoot(3, 1, [(0, 0)], 0, 0)]
     for _ in range(2):
         logger.recovery._with_holes = None
-        logger.recovery._compare(ACCEL, boots)
+        logger.recovery._compare(SpoolListed(ACCEL, boots, False))
     assert logger.seen.streams[(ACCEL, 1)].ranges() == [(0, 2)]
     assert logger.lost == {0, 1, 2, 5}
     assert [query for _, query in logger.recovery._trucks[("live", "truck-1")].todo] == [
