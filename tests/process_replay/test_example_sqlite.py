@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -24,9 +24,28 @@ from tests.waiting import LONGEST_S, until
 pytestmark = pytest.mark.process
 
 
+class Bus(NamedTuple):
+    """Address of a bus, and the arguments with which the subscriber joins it."""
+
+    endpoint: str
+    credentials: Path | None = None
+
+    @property
+    def joined_with(self) -> list[Path]:
+        return [] if self.credentials is None else [self.credentials / "viewer"]
+
+
+@pytest.fixture(params=["open", "secured"])
+def bus(request: pytest.FixtureRequest) -> Bus:
+    if request.param == "open":
+        return Bus(request.getfixturevalue("endpoint"))
+    return Bus(*map(request.getfixturevalue, ("tls_endpoint", "credentials")))
+
+
 @pytest.fixture
-def publisher(endpoint: str) -> Iterator[Publisher]:
-    with open_session(listen=endpoint) as session:
+def publisher(bus: Bus) -> Iterator[Publisher]:
+    tls = None if bus.credentials is None else bus.credentials / "logger"
+    with open_session(listen=bus.endpoint, tls=tls) as session:
         publisher = Publisher(session, "live")
         yield publisher
         publisher.close()
@@ -50,13 +69,13 @@ def rows(path: Path, query: str) -> list[tuple[object, ...]]:
 
 
 def test_each_crossing_is_stored_once_with_its_newest_result(
-    publisher: Publisher, endpoint: str, tmp_path: Path, project: Path
+    publisher: Publisher, bus: Bus, tmp_path: Path, project: Path
 ) -> None:
     folder = project / "docs/examples/sqlite"
     path = tmp_path / "results.sqlite"
     put(publisher, project, created=2e9, name="before the start")
     program = subprocess.Popen(
-        [sys.executable, folder / "results_to_sqlite.py", endpoint, path],
+        [sys.executable, folder / "results_to_sqlite.py", bus.endpoint, path, *bus.joined_with],
         env=os.environ | {"PYTHONPATH": str(project)},
         stderr=subprocess.PIPE,
         text=True,

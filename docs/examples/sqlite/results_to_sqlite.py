@@ -1,12 +1,14 @@
 """Subscriber that keeps the result of each crossing in SQLite, until Ctrl-C.
 
 python results_to_sqlite.py tcp/127.0.0.1:7447 results.sqlite
+python results_to_sqlite.py tls/logger.example.org:7447 results.sqlite certs/viewer
 """
 
 import contextlib
 import json
 import sqlite3
 import sys
+from pathlib import Path
 
 import zenoh
 
@@ -43,14 +45,31 @@ def store(database: sqlite3.Connection, found: pb.Estimate) -> None:
                 database.execute("INSERT INTO element VALUES (?, ?, ?, ?, ?, ?)", element)
 
 
-def main(endpoint: str, path: str) -> None:
-    """Receive results, those from before the start too, and store each."""
+def config_of(endpoint: str, credentials: str | None) -> zenoh.Config:
+    """Return the settings of a client, with a folder of `driveby certs` those of mutual TLS."""
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    if credentials is not None:
+        folder = Path(credentials).absolute()
+        tls = {
+            "root_ca_certificate": str(folder / "ca.pem"),
+            "connect_private_key": str(folder / "key.pem"),
+            "connect_certificate": str(folder / "cert.pem"),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+        }
+        config.insert_json5("transport/link/protocols", json.dumps(["tls"]))
+        config.insert_json5("transport/link/tls", json.dumps(tls))
+    return config
+
+
+def main(endpoint: str, path: str, credentials: str | None = None) -> None:
+    """Receive results, those from before the start too, and store each."""
     history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
     topic = "driveby/v1/*/bridge/*/estimate"
-    with contextlib.closing(sqlite3.connect(path)) as database, zenoh.open(config) as session:
+    session = zenoh.open(config_of(endpoint, credentials))
+    with session, contextlib.closing(sqlite3.connect(path)) as database:
         database.executescript(TABLES)
         received = zenoh.ext.declare_advanced_subscriber(session, topic, history=history)
         for sample in received:
