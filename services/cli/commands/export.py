@@ -1,5 +1,6 @@
 """The command `driveby export`: measurements and results for other programs."""
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -148,7 +149,11 @@ def _results(sources: Sequence[Path]) -> "tuple[Results | None, Path]":
 
     paths = [path for path in sources if path.suffix == ".json"]
     if len(paths) > 1:
-        raise InputError(f"{paths[1]}: is a second results file, export one at a time")
+        both = shlex.join(map(str, paths[:2])) + (" …" if len(paths) > 2 else "")
+        raise InputError(
+            f"{paths[1]}: is a second results file; fuse them first (driveby fuse {both} --json "
+            "all.json) and export that, or export each into a folder of its own"
+        )
     return (load_results(paths[0]), paths[0]) if paths else (None, Path())
 
 

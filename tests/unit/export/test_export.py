@@ -227,7 +227,8 @@ def test_what_cannot_be_exported_is_one_line(
     for arguments, words in (
         ((sample, "--to", stale), "holds accel_01.csv of another drive"),
         ((sample, "--to", tmp_path / "file"), "is a file, give the name of a folder"),
-        ((results, results.with_name("x.json"), *to), "is a second results file"),
+        ((results, results.with_name("x.json"), *to), "is a second results file; fuse them first"),
+        ((results, results.with_name("x.json"), *to), f"driveby fuse {results} "),
         ((tmp_path / "none.mcap", *to), "no such file"),
         ((tmp_path / "none.json", *to), "no such file"),
         (
