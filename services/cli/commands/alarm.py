@@ -28,6 +28,10 @@ if TYPE_CHECKING:
 _WHAT = ("check", "list", "ack", "serve")
 _MAX_LINES = 20
 """Maximum number of listed bridges without monitoring."""
+_EXIT_UNCHECKED: Final = 3
+"""Exit code of --exit-code where files or bridges could not be read or compared."""
+_EXIT_ALARM: Final = 4
+"""Exit code of --exit-code while an alarm is active."""
 _HOW = (
     "an alarm compares periods; identify and fuse combine all crossings, which hides a change\n"
     "draw it with driveby history BRIDGE --period {period} --figures DIR, inspect the bridge, then "
@@ -74,6 +78,10 @@ class AlarmOptions(OnTheBus):
         metavar="PERCENT",
     )
     all: bool = flag("check all bridges, not only those with new crossings or periods")
+    exit_code: bool = flag(
+        "with check and list: end with exit code 4 while an alarm is active, else with 3 if a file "
+        "or a bridge could not be checked"
+    )
     processes: int = opt(
         "number of processes (default: 1)", whole("a number", 1, 256), default=1, metavar="N"
     )
@@ -91,10 +99,12 @@ def _alarm(options: AlarmOptions) -> int:
     what, bridge = options.what, options.bridge
     if (bridge is None) == (what == "ack"):
         raise InputError("alarm: ack needs the name of a bridge; check, list and serve take none")
+    if options.exit_code and what not in ("check", "list"):
+        raise InputError("--exit-code: needs check or list")
     if bridge is not None:
         return _acknowledge(options, bridge)
     if what == "list":
-        return _list(options.history, options.period)
+        return _list(options)
     if what == "serve":
         return _serve(options)
     checked = _checked(options)
@@ -102,10 +112,19 @@ def _alarm(options: AlarmOptions) -> int:
     print(f"{checks} checked, {alarms}")
     for alarm in checked.standing:
         print(alarm_line(alarm))
-    _print_watches(options.history)
-    if checked.standing:
+    is_complete = _print_watches(options.history) and not checked.problems
+    return _ended(options, has_alarm=bool(checked.standing), is_complete=is_complete)
+
+
+def _ended(options: AlarmOptions, *, has_alarm: bool, is_complete: bool) -> int:
+    """Print what to do after an alarm; return the exit code."""
+    if has_alarm:
         print(_HOW.format(period=options.period))
-    return 0
+    if not options.exit_code:
+        return 0
+    if has_alarm:
+        return _EXIT_ALARM
+    return 0 if is_complete else _EXIT_UNCHECKED
 
 
 def _settings(options: AlarmOptions) -> "AlarmSettings":
@@ -133,41 +152,42 @@ def _checked(options: AlarmOptions) -> "AlarmCheck":
     return checked
 
 
-def _list(folder: Path, period: str) -> int:
+def _list(options: AlarmOptions) -> int:
     from services.history.alarm_files import alarms_of, bridges_with_alarms
     from services.history.history_store import bridges_of
 
+    folder = options.history
     bridges_of(folder)  # it raises where there is no such folder
-    number = standing = 0
+    number = standing = unread = 0
     for realm, bridge in bridges_with_alarms(folder):
         alarms, problems = alarms_of(folder, realm, bridge)
         for line in (*problems, *map(alarm_line, alarms)):
             print(line)
+        unread += len(problems)
         number += len(alarms)
         standing += sum(alarm.acknowledged is None for alarm in alarms)
     if not number:
         print("no alarms")
-    _print_watches(folder)
-    if standing:
-        print(_HOW.format(period=period))
-    return 0
+    is_complete = _print_watches(folder) and not unread
+    return _ended(options, has_alarm=bool(standing), is_complete=is_complete)
 
 
-def _print_watches(folder: Path) -> None:
-    """Print how many bridges are monitored, and why the others are not."""
+def _print_watches(folder: Path) -> bool:
+    """Print how many bridges are monitored, and why others are not; return whether all was read."""
     from services.history.alarms import monitoring_states
 
     found, problems = monitoring_states(folder, time.time())
     for problem in problems:
         print(problem)
     if not found:
-        return
+        return not problems
     others = {name: one for name, one in found.items() if one.state not in ("watched", "alarm")}
     print(_how_many_monitored(len(found) - len(others), len(found)))
     for realm, bridge in list(others)[:_MAX_LINES]:
         print(f"{bridge} in realm {realm}: {others[(realm, bridge)].sentence}")
     if len(others) > _MAX_LINES:
         print(f"and {count_of(len(others) - _MAX_LINES, 'more bridge')} not monitored")
+    return not problems
 
 
 def _how_many_monitored(monitored: int, bridges: int) -> str:

@@ -322,6 +322,25 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     assert "(props)" in capsys.readouterr().out
 
 
+def test_exit_code_reports_alarms_and_failures_on_request(
+    history: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there = ["--history", str(history)]
+    asked = [*there, "--exit-code"]
+    assert cli.main(["alarm", "list", *asked]) == 0
+    assert cli.main(["alarm", "check", *asked]) == 4
+    assert cli.main(["alarm", "list", *asked]) == 4
+    assert cli.main(["alarm", "list", *there]) == 0
+    assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", *there]) == 0
+    assert cli.main(["alarm", "list", *asked]) == cli.main(["alarm", "check", *asked]) == 0
+    (history / "alarms/realm=sim-fleet/bridge=bridge-2/noise.json").write_text("{")
+    assert cli.main(["alarm", "list", *asked]) == cli.main(["alarm", "check", *asked]) == 3
+    assert cli.main(["alarm", "check", *there]) == 0
+    capsys.readouterr()
+    assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", *asked]) == 2
+    assert capsys.readouterr().err == "driveby: --exit-code: needs check or list\n"
+
+
 def test_unpublished_notes_are_published_at_the_start(history: Path) -> None:
     """Who heard the alarm stand shows it until it hears that somebody took note of it."""
     (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
