@@ -8,6 +8,7 @@ from schemas.topics import check_identifier
 from services.common.errors import InputError
 
 _MOMENT: Final = "%Y%m%dT%H%M%S.%f"
+_DAY_S: Final = 86_400.0
 _ENTRY: Final = re.compile(r"\.(\d{8}T\d{6}\.\d{3})Z$")
 
 
@@ -44,3 +45,8 @@ def count_of(number: float, noun: str, plural: str = "") -> str:
 def processes_in_words(number: int) -> str:
     """Return a number of processes with its noun."""
     return "1 process" if number == 1 else f"{number} processes"
+
+
+def offset_in_words(seconds: float, digits: int) -> str:
+    """Return a clock's offset in s with some digits, one of a day or more in days."""
+    return f"{seconds / _DAY_S:.1f} days" if seconds >= _DAY_S else f"{seconds:.{digits}f} s"

@@ -14,8 +14,12 @@ from itertools import combinations
 from statistics import median
 from typing import NamedTuple
 
+from services.common.naming import offset_in_words
+
 STEP_NS = 500_000_000
 """Smallest step; a smaller jump counts as drift, because steered clocks slew by less."""
+_SURELY_BEHIND_NS = 86_400_000_000_000
+"""Offset that no delay explains, so that the first message shows it."""
 _MINUTE_NS = 60_000_000_000
 _MINUTES = 60
 """Number of minutes in the slope."""
@@ -40,7 +44,7 @@ class ClockDrift(NamedTuple):
     def __str__(self) -> str:
         """Return how far the truck's clock is behind or ahead."""
         direction = "ahead of" if self.offset_s < 0.0 else "behind"
-        return f"{abs(self.offset_s):.3f} s {direction} the logger's"
+        return f"{offset_in_words(abs(self.offset_s), 3)} {direction} the logger's"
 
 
 def clock_step_ns(before_ns: int | None, offset_ns: int) -> int:
@@ -92,13 +96,14 @@ class TruckClock:
     def drift(self) -> ClockDrift | None:
         """Return offset and drift over the last hour; None in the first minute.
 
-        A clock that is ahead from the start is known at once: no delay makes a message come early.
+        A clock that is ahead, or a day behind, is known at once: no delay explains either.
         After a step, which has an event of its own, the minute is waited for.
         """
         if self._drift is not None or self._is_stepped or self._smallest is None:
             return self._drift
         delay_ns = self._smallest[1]
-        return ClockDrift(delay_ns * 1e-9, None) if delay_ns <= -STEP_NS else None
+        is_certain = delay_ns <= -STEP_NS or delay_ns >= _SURELY_BEHIND_NS
+        return ClockDrift(delay_ns * 1e-9, None) if is_certain else None
 
     def due(self, now_s: float) -> ClockDrift | None:
         """Return the drift if it should be recorded: first, and when it has moved by 50 ms.

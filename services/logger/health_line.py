@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 
 from schemas.signals import NS_PER_S
-from services.common.naming import count_of
+from services.common.naming import count_of, offset_in_words
 from services.logger.clocks import STEP_NS
 
 _MAX_NAMED = 3
@@ -22,7 +22,8 @@ def health_line(figures: Mapping[str, float]) -> str:
         why = " (old samples: replayed faster than real time, sent late, or a clock is wrong)"
     return (
         f"{count_of(known['trucks_alive'], 'truck')}, {known['rate_per_s']:.0f} messages/s, "
-        f"lag {known['lag_s']:.2f} s{why}, queue {known['queue']:.0f}, lost {known['lost']:.0f}, "
+        f"lag {offset_in_words(known['lag_s'], 2)}{why}, "
+        f"queue {known['queue']:.0f}, lost {known['lost']:.0f}, "
         f"missing {known['missing']:.0f}, recovered {known['recovered']:.0f}, "
         f"duplicates {known['duplicates']:.0f}, refused {known['refused']:.0f}, "
         f"dropped {known['dropped']:.0f}, written {known['written']:.0f}, "
@@ -48,6 +49,7 @@ def clock_note(figures: Mapping[str, float]) -> str:
 
 
 def _named(what: str, trucks_s: Mapping[str, float]) -> str:
-    shown = [f"{truck} by {by_s:.1f} s" for truck, by_s in list(trucks_s.items())[:_MAX_NAMED]]
+    few = list(trucks_s.items())[:_MAX_NAMED]
+    shown = [f"{truck} by {offset_in_words(by_s, 1)}" for truck, by_s in few]
     more = " …" if len(trucks_s) > _MAX_NAMED else ""
     return f"{what}: {', '.join(shown)}{more}" if shown else ""

@@ -11,12 +11,13 @@ from typing import Any, Final
 
 import zenoh
 
-from schemas.signals import TRUCK_DECODERS, Identity
-from schemas.topics import Key, parse_key, selector
+from schemas.signals import NS_PER_S, TRUCK_DECODERS, Identity
+from schemas.topics import Key, is_from_recording, is_simulated, parse_key, selector
 from services.bus.liveness import LivenessProbe, StaleConnectionError
 from services.bus.realm_listener import OtherRealms
 from services.bus.subscription import RawSample, SeenSequences, Subscription
 from services.common.log_lines import about
+from services.common.naming import offset_in_words
 from services.worker.arrivals import LivenessToken, TruckMessage
 
 _log = logging.getLogger(__name__)
@@ -24,6 +25,12 @@ POLL_S: Final = 0.1
 """Longest delay in s after which a stop, a token or a result is noticed without a message."""
 _LONGEST_QUEUE: Final = 200_000
 """Messages, two hours of one truck or a minute of a hundred; beyond them publishers wait."""
+_BEHIND_S: Final = 86_400.0
+"""Age of a new sample in s that no delay explains."""
+_AHEAD_S: Final = 60.0
+"""Time in s by which a sample lies in the future when a clock is wrong."""
+_MAX_CLOCKS: Final = 1000
+"""Number of trucks with a line on their clock."""
 ArrivalsQueue = queue.Queue[TruckMessage | LivenessToken]
 
 
@@ -46,6 +53,8 @@ class MessageReceiver:
         self._refused = Counter() if refused is None else refused
         self._closing, self._failed = threading.Event(), threading.Event()
         self._seen = SeenSequences()
+        self._wrong_clocks: set[str] = set()
+        """Trucks whose clocks were logged as wrong."""
         self._thread = threading.Thread(target=self._receive, name="receive", daemon=True)
 
     @property
@@ -116,7 +125,7 @@ class MessageReceiver:
         try:
             # A router that cuts off a reader in the middle of a message leaves the rest of it
             # to the next one. A good copy follows, which must not count as known.
-            _check_whole(received.payload, key, identity)
+            wall_time_ns = _check_whole(received.payload, key, identity)
         except ValueError as error:
             line = "refused %s of %s: %.200s"
             fields = about(vehicle=key.identifier)
@@ -124,7 +133,24 @@ class MessageReceiver:
             self._refused["receiver"] += 1
             return
         if self._seen.add(key, identity):
+            if not received.recovered:
+                self._check_clock(key, time.time() - wall_time_ns / NS_PER_S)
             self._put(TruckMessage(key, *identity, received.payload, now_s))
+
+    def _check_clock(self, key: Key, age_s: float) -> None:
+        """Log once that a truck's new samples are impossibly old or in the future."""
+        is_right = -_AHEAD_S <= age_s < _BEHIND_S
+        if is_right or is_simulated(key.realm) or is_from_recording(key.realm):
+            return
+        if key.identifier not in self._wrong_clocks and len(self._wrong_clocks) < _MAX_CLOCKS:
+            self._wrong_clocks.add(key.identifier)
+            _log.warning(
+                "the clock of %s is %s %s this machine's; its crossings get wrong dates",
+                key.identifier,
+                offset_in_words(abs(age_s), 0),
+                "ahead of" if age_s < 0.0 else "behind",
+                extra=about(vehicle=key.identifier),
+            )
 
     def _put(self, item: TruckMessage | LivenessToken) -> None:
         """Wait for room in the queue, but not beyond the end of the service."""
@@ -140,11 +166,15 @@ def _token(sample: Any, now_s: float) -> LivenessToken:
     return LivenessToken(key.realm, key.identifier, sample.kind == zenoh.SampleKind.PUT, now_s)
 
 
-def _check_whole(payload: bytes, key: Key, identity: Identity) -> None:
-    """Raise ValueError for a malformed payload, or one that differs from its attachment."""
+def _check_whole(payload: bytes, key: Key, identity: Identity) -> int:
+    """Return the wall time of a message in ns.
+
+    Raise ValueError for a malformed payload, or one that differs from its attachment.
+    """
     message = TRUCK_DECODERS[key.stream](payload)
     if (message.boot_id, message.sequence) != identity:
         raise ValueError(
             f"claims to be {message.sequence} of boot {message.boot_id}, and came as "
             f"{identity.sequence} of boot {identity.boot_id}"
         )
+    return int(message.wall_time_ns)

@@ -24,3 +24,11 @@ def test_one_truck_and_one_file_are_singular() -> None:
     assert line.startswith("1 truck, ")
     assert ", 1 open file, " in line
     assert health_line({}).startswith("0 trucks, ")
+
+
+def test_offsets_of_years_are_in_days() -> None:
+    note = clock_note({"clock_offset_s/a": -129_600_000.0, "clock_offset_s/b": 86_400.0})
+    assert (
+        note == "clocks ahead: a by 1500.0 days; clocks behind, or all samples late: b by 1.0 days"
+    )
+    assert ", lag 2200.0 days (old samples" in health_line({"lag_s": 190_080_000.0})

@@ -180,6 +180,14 @@ def test_late_message_reports_no_clock_at_once() -> None:
     assert intake.clock_figures() == {}
 
 
+def test_clock_that_is_years_behind_is_reported_at_the_first_message() -> None:
+    intake = make()
+    intake.accept(message(0, device_ns=0, wall_ns=NOW_NS - 2200 * DAY_NS), NOW_NS)
+    [(_, event)] = intake.report(*at(0.1))
+    assert event.kind == EventKind.CLOCK_DRIFT
+    assert event.text == "the truck's clock is 2200.0 days behind the logger's"
+
+
 def test_a_replays_old_times_say_nothing_of_clocks() -> None:
     intake = make()
     for number in range(1000):

@@ -15,7 +15,7 @@ import zenoh
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import ResultHeader
 from schemas.settings import IdentificationSettings
-from schemas.signals import Identity
+from schemas.signals import NS_PER_S, GnssFix, Identity, encode_gnss
 from schemas.topics import Key, topic
 from services.bus.publisher import Publisher
 from services.bus.subscription import RawSample
@@ -470,3 +470,34 @@ def test_receiver_counts_what_it_refuses() -> None:
         receiver._take(sample, one.key, Identity(1, 0), 0.0)
     assert refused.total() == 3
     assert receiver.queued.empty()
+
+
+@pytest.mark.parametrize(
+    ("realm", "offset_s", "words"),
+    [
+        ("live", -2200 * 86_400.0, "the clock of truck-1 is 2200.0 days behind this machine's"),
+        ("live", 90.0, "the clock of truck-1 is 90 s ahead of this machine's"),
+        ("live", -3600.0, ""),
+        ("sim-x", -2200 * 86_400.0, ""),
+        ("replay-x", -2200 * 86_400.0, ""),
+    ],
+)
+def test_wrong_clock_of_a_truck_is_logged_once(
+    realm: str,
+    offset_s: float,
+    words: str,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    receiver = receiving.MessageReceiver(cast("zenoh.Session", None), realm, print)
+    now_ns = 1_800_000_000 * NS_PER_S
+    monkeypatch.setattr("services.worker.receiving.time.time", lambda: now_ns / NS_PER_S)
+    key = Key(realm, "vehicle", "truck-1", "gnss")
+    for sequence in range(3):
+        fix = GnssFix(1, sequence, 0, now_ns + round(offset_s * NS_PER_S), 50.0, 8.0, 0.0, 9.0)
+        sample = RawSample("", encode_gnss(fix), None, False)
+        receiver._take(sample, key, Identity(1, sequence), 0.0)
+    assert receiver.queued.qsize() == 3
+    lines = [record.getMessage() for record in caplog.records]
+    assert len(lines) == bool(words)
+    assert words in "".join(lines)
