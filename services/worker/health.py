@@ -16,6 +16,7 @@ from services.worker.backfill import Backfill, WaitingCounts
 
 _log = logging.getLogger(__name__)
 _LONGEST_NOTE = 1000
+_MAX_NAMED = 3
 _CAUSES = {
     "for_process": "for a process",
     "for_validation": "for a site validation",
@@ -41,6 +42,8 @@ class Workload(NamedTuple):
     waiting: int
     waiting_for_certificate: int
     in_recordings: WaitingCounts
+    unknown_vehicles: tuple[str, ...] = ()
+    """Trucks that drive and are not in the site file."""
 
 
 def workload(engine: Engine, execution: CrossingExecutor, source: Backfill | None) -> Workload:
@@ -52,6 +55,7 @@ def workload(engine: Engine, execution: CrossingExecutor, source: Backfill | Non
         execution.waiting + ready,
         sum(waiting.values()) - ready,
         WaitingCounts() if source is None else source.waiting,
+        tuple(sorted(engine.unknown_vehicles)),
     )
 
 
@@ -91,6 +95,10 @@ def publish_health(
     ]
     notes += [f"refused {count_of(behind.refused, 'invalid message')}"] if behind.refused else []
     notes += [note] if note else []
+    if load.unknown_vehicles:
+        more = " …" if len(load.unknown_vehicles) > _MAX_NAMED else ""
+        named = ", ".join(load.unknown_vehicles[:_MAX_NAMED])
+        notes.append(f"not in the site file, so without results: {named}{more}")
     figures = {
         "queue": float(behind.messages),
         "lag_s": behind.lag_s,

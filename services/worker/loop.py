@@ -55,6 +55,7 @@ class SiteReload(NamedTuple):
         path = free_results_path(service.files.path.parent)
         service.files.rotate(path, edited.text, header)
         service.certificates.retarget(edited.site)
+        service.site_fit.retarget(edited.site.bridges)
         if backfill is not None:
             backfill.retarget(edited.site)
         _log.info("%s was edited: %s applies now, results in %s", first.path, edited.hash, path)
@@ -165,6 +166,7 @@ class Loop:
             if self._stop.is_set() and not self._arrivals.is_leaving(one.key):
                 continue  # the truck sends it to the next run again
             try:
+                self._service.site_fit.note(one.key, one.payload, self._now_s)
                 outputs = self._engine.feed(one.key, one.payload)
             except ValueError as error:
                 name = f"{one.key.stream} of {one.key.identifier}"

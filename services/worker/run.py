@@ -107,6 +107,7 @@ def _run(asked: WorkerSettings, search: Search, ready: Callable[[], None] | None
         engine = _engine(asked, search, execution)
         certified = ValidationRunner(search.certificates, search.site, search.settings, execution)
         service = WorkerService(asked.service_id, engine, execution, certified, publisher, files)
+        service.site_fit.retarget(search.site.bridges)
         backfill = _backfill(asked, search, ledger)
         if backfill is not None:
             stack.callback(backfill.close)

@@ -29,6 +29,7 @@ from services.identification.engine import Engine
 from services.identification.outputs import EngineOutput, Output
 from services.ledger.runs import EarlierRuns, ResultFiles
 from services.worker.health import QueueLag, Workload, log_result, publish_health
+from services.worker.site_fit import SiteFit
 from services.worker.validation_runner import ValidationRunner
 
 _log = logging.getLogger(__name__)
@@ -64,6 +65,7 @@ class WorkerService:
     """Numbers of this run's results, by verdict."""
     refused: Counter[str] = field(default_factory=Counter)
     """Numbers of invalid messages, by the thread that refused them: each counts on its own."""
+    site_fit: SiteFit = field(default_factory=SiteFit)
 
     def publish(self, outputs: Iterable[Output]) -> None:
         """Write each message to the disk and only then to the bus.
@@ -95,7 +97,8 @@ class WorkerService:
         put = partial(self.publisher.put, "service", self.id, "health")
         publish_health(
             put, self.id, self.execution, behind, load,
-            verdicts=self.verdicts, note=self.certificates.note,
+            verdicts=self.verdicts,
+            note="; ".join(filter(None, (self.certificates.note, self.site_fit.complaint()))),
         )  # fmt: skip
 
     def publish_end(self) -> None:
