@@ -19,6 +19,15 @@ _NAME_PART: Final = 4
 """Index of the owner's identifier in the parts of a key."""
 
 
+def sessions_publishing(session: zenoh.Session, where: str, timeout_s: float) -> int:
+    """Return how many other sessions publish a key, of which one should."""
+    token = f"{where}/@adv/pub/"
+    replies = session.liveliness().get(f"{token}**", timeout=timeout_s)
+    keys = (str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
+    ids = {one.removeprefix(token).partition("/")[0] for one in keys}
+    return len(ids - {str(session.info.zid())})
+
+
 class Presence:
     """Whether a session is connected, and the services whose publishers have left."""
 

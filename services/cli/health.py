@@ -16,6 +16,7 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.topics import PREFIX, check_identifier, check_realm, key
 from services.bus.access_control import read_by
 from services.bus.credentials import check_credentials, unlisted_hint
+from services.bus.presence import sessions_publishing
 from services.bus.session import open_session
 from services.bus.subscription import Subscription
 from services.common.errors import FailureError, InputError
@@ -49,6 +50,7 @@ def health_command(
     ):
         latest = _latest(subscription, patience_s)
         elsewhere = _realms_of(session, service) if latest is None else []
+        senders = sessions_publishing(session, where, _ELSEWHERE_S) if latest is not None else 0
     if latest is None:
         if elsewhere:
             hint = f"it answers with --realm {' or '.join(elsewhere)}"
@@ -65,6 +67,8 @@ def health_command(
             f"{service} in realm {realm} is not well: {latest.note or 'see its log'}"
         )
     notes = [latest.note] if latest.note else []
+    if senders > 1:
+        notes.append(f"one of {senders} services of this name; give each one another --id")
     if age_s < -_AHEAD_S:
         notes.append(f"its clock is {-age_s:.0f} s ahead of this machine's")
     return "; ".join([f"{service} in realm {realm} is well, {max(age_s, 0.0):.0f} s ago", *notes])

@@ -16,11 +16,14 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import zenoh
+
 from schemas.settings import IdentificationSettings
 from schemas.site_file import parse_site, read_site_text
-from schemas.topics import check_identifier, check_realm, is_from_recording
+from schemas.topics import check_identifier, check_realm, is_from_recording, key
 from services.bus.credentials import check_speaks_for
 from services.bus.playback import leave_at_once, set_by_signals, stopped_by_signals
+from services.bus.presence import sessions_publishing
 from services.bus.publisher import Publisher
 from services.bus.session import wait_for_router
 from services.common.errors import FailureError, InputError
@@ -56,6 +59,8 @@ from services.worker.validation_runner import ValidationRunner
 
 _log = logging.getLogger(__name__)
 _DAY_S = 86_400.0
+_NAMESAKE_S = 1.0
+"""Longest wait in s for the router to name workers of the same id."""
 _LOCK = ".worker.lock"
 _IN_USE = (
     "another worker writes its results here; stop it first, or give this one another --realm or "
@@ -103,6 +108,7 @@ def _run(asked: WorkerSettings, search: Search, ready: Callable[[], None] | None
             _log.info("stopped by a signal before a router answered")
             return 0
         stack.enter_context(bus)
+        _warn_of_namesake(bus, asked)
         publisher = Publisher(bus, asked.realm)
         engine = _engine(asked, search, execution)
         certified = ValidationRunner(search.certificates, search.site, search.settings, execution)
@@ -148,6 +154,17 @@ def _check(asked: WorkerSettings) -> None:
         raise InputError(
             f"--method {method}: has no site validation, which realm live and --validate-first "
             "require; use --method pre or --skip-validation"
+        )
+
+
+def _warn_of_namesake(bus: zenoh.Session, asked: WorkerSettings) -> None:
+    """Log that another worker of this id runs in the realm, whose results go elsewhere."""
+    health = key(asked.realm, "service", asked.service_id, "health")
+    if sessions_publishing(bus, health, _NAMESAKE_S):
+        _log.warning(
+            "another worker %s runs in realm %s and identifies the same crossings; stop one of "
+            "them, or give this one another --id",
+            *(asked.service_id, asked.realm),
         )
 
 

@@ -18,7 +18,7 @@ import zenoh
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import load_results
 from schemas.signals import Identity, decode_info, encode_info
-from schemas.topics import Message, selector
+from schemas.topics import Message, key, selector
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
 from services.bus.subscription import RawSample, Subscription
@@ -33,7 +33,7 @@ from services.worker.run import run as run_worker
 from services.worker.settings import WorkerSettings
 from tests.builders.processes import stop
 from tests.receiving import get_latest, several
-from tests.waiting import LONGEST_S
+from tests.waiting import LONGEST_S, until
 
 pytestmark = pytest.mark.process
 
@@ -419,6 +419,24 @@ def test_one_worker_at_a_time_writes_a_folder(
     assert not left.exists()  # without a message it is set aside by the next run
     assert left.with_name(f"{left.name}.crashed").exists()
     kill(second)
+
+
+@pytest.mark.parametrize(("name", "lines"), [("worker", 1), ("another", 0)])
+def test_worker_warns_of_one_with_its_name(
+    bus: zenoh.Session, worker: Begin, name: str, lines: int
+) -> None:
+    publisher = Publisher(bus, REALM)
+    health = pb.Health(schema_version=1, time_ns=time.time_ns(), service=name, ok=True)
+    publisher.put("service", name, "health", health.SerializeToString())
+    with Subscription(bus, key(REALM, "service", "worker", "health")) as listening:
+        process = worker()
+        until(
+            lambda: (one := listening.receive(0.2)) and one.payload != health.SerializeToString(),
+            "the worker's own health",
+        )
+        log = stop(process)
+    publisher.close()
+    assert log.count(f"another worker worker runs in realm {REALM}") == lines
 
 
 WHOLE = ["crossing"] * 3 + ["estimate", "crossing", "state"]

@@ -96,3 +96,23 @@ def test_silent_service_is_found_in_its_own_realm(endpoint: str) -> None:
     assert str(caught.value) == (
         f"logger in realm sim-two sends nothing at {endpoint}; it answers with --realm live"
     )
+
+
+def test_services_of_one_name_are_counted(endpoint: str) -> None:
+    with (
+        open_session(listen=endpoint),
+        open_session(connect=endpoint) as first,
+        open_session(connect=endpoint) as second,
+    ):
+        publishers = [Publisher(session, "live") for session in (first, second)]
+        lines = []
+        for publisher in publishers:
+            sent = pb.Health(schema_version=1, service="worker", ok=True, time_ns=time.time_ns())
+            publisher.put("service", "worker", "health", sent.SerializeToString())
+            lines.append(
+                health_command(service="worker", endpoint=endpoint, tls=None, realm="live")
+            )
+        for publisher in publishers:
+            publisher.close()
+    assert lines[0] == "worker in realm live is well, 0 s ago"
+    assert lines[1] == f"{lines[0]}; one of 2 services of this name; give each one another --id"
