@@ -1,8 +1,6 @@
 """The command `driveby validate --site`: validation records of a site file's pairs."""
 
 import time
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -16,7 +14,7 @@ from schemas.validation_records import (
     pair_hash,
     validation_path,
 )
-from services.common.child_process import end_with_parent
+from services.common.child_process import ChildPool
 from services.common.errors import InputError
 from services.common.files import check_writable, make_folder
 from services.common.language import ENGLISH
@@ -71,7 +69,7 @@ def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
     # A fork is impossible: the threads of numba and OpenBLAS would not survive it.
     with (
         progress_bar(console) as bar,
-        ProcessPoolExecutor(asked.processes, get_context("spawn"), end_with_parent) as pool,
+        ChildPool(asked.processes, "spawn") as pool,
     ):
         task = bar.add_task("simulated crossings", total=len(pairs))
         for done, pair in enumerate(pairs):

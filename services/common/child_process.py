@@ -16,14 +16,17 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
-from typing import NamedTuple
+from typing import NamedTuple, ParamSpec, TypeVar
 
 from services.common.errors import EXIT_INTERRUPTED
 
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 _CLEAN_UP_S = 2.0
 """Time to remove incomplete files; then the process ends in any case."""
 _NO_WARNING = "ignore:resource_tracker"
@@ -108,11 +111,29 @@ def ignore_group_signals() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def end_with_parent() -> None:
-    """Let this process of a pool end at once when its parent dies: an initializer.
+class ChildPool(ProcessPoolExecutor):
+    """A pool whose processes end silently with an interrupt of the command, and with its death."""
 
-    Otherwise it would finish its work unused, and then wait for more for ever.
+    def __init__(self, processes: int, method: str) -> None:
+        """Create the pool; `method` is how multiprocessing starts its processes."""
+        super().__init__(processes, multiprocessing.get_context(method), _end_with_parent)
+
+    def submit(
+        self, call: Callable[_P, _T], /, *arguments: _P.args, **named: _P.kwargs
+    ) -> Future[_T]:
+        """Start the call in a process, which may be created for it."""
+        with group_signals_blocked():
+            return super().submit(call, *arguments, **named)
+
+
+def _end_with_parent() -> None:
+    """Let this process of a pool end at once at a signal, and when its parent dies.
+
+    Otherwise it would print a traceback, or finish its work unused and wait for more for ever.
     """
+    for number in _OF_THE_GROUP:
+        signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _OF_THE_GROUP)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_after, args=(parent,), name="leash", daemon=True).start()

@@ -6,9 +6,7 @@ While an alarm stands, no other of that bridge is raised. `alarm_files` holds it
 import json
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from datetime import UTC, datetime
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -23,7 +21,7 @@ from pre_core.monitoring.change_detection import (
 )
 from pre_core.monitoring.observation import Observation, combine_observations
 from schemas.alarms import Alarm
-from services.common.child_process import end_with_parent
+from services.common.child_process import ChildPool
 from services.common.files import make_folder, write_atomically
 from services.history.alarm_files import ALARMS, alarms_folder, alarms_of, standing_alarms
 from services.history.history_store import (
@@ -190,7 +188,7 @@ def check(
     problems: list[str] = []
     given = ((folder, batch, settings, now_s) for batch in batches)
     if processes > 1 and len(batches) > 1:
-        with ProcessPoolExecutor(processes, get_context("forkserver"), end_with_parent) as pool:
+        with ChildPool(processes, "forkserver") as pool:
             results = list(pool.map(_checked_batch, given))
     else:
         results = [_checked_batch(one) for one in given]

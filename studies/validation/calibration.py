@@ -5,8 +5,7 @@ can be stored, merged and inspected singly.
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from concurrent.futures import as_completed
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from schemas.results import CrossingResult, Parameter
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from services.common.arrays import Floats
-from services.common.child_process import end_with_parent
+from services.common.child_process import ChildPool
 from services.identification.result_parts import detrended
 from services.simulation.drawn import (
     IdentifiedCrossing,
@@ -165,7 +164,7 @@ def in_processes(
             progress(lines[-1])
         return lines
     # A fork is impossible: the threads of numba and OpenBLAS would not survive it.
-    with ProcessPoolExecutor(processes, get_context("spawn"), end_with_parent) as pool:
+    with ChildPool(processes, "spawn") as pool:
         futures = [pool.submit(job) for job in jobs]
         try:
             for future in as_completed(futures):
