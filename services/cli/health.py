@@ -7,6 +7,7 @@ accepts, and a service that connects, is admitted and has not stopped.
 
 import contextlib
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import zenoh
@@ -49,13 +50,10 @@ def health_command(
         Subscription(session, where) as subscription,
     ):
         latest = _latest(subscription, patience_s)
-        elsewhere = _realms_of(session, service) if latest is None else []
+        elsewhere = realms_of(session, service) if latest is None else []
         senders = sessions_publishing(session, where, _ELSEWHERE_S) if latest is not None else 0
     if latest is None:
-        if elsewhere:
-            hint = f"it answers with --realm {' or '.join(elsewhere)}"
-        else:
-            hint = silence_hint(where, tls)
+        hint = realms_hint(elsewhere) or silence_hint(where, tls)
         raise FailureError(f"{service} in realm {realm} sends nothing at {endpoint}; {hint}")
     if latest.ended:
         raise FailureError(f"{service} in realm {realm} has ended")
@@ -88,10 +86,15 @@ def silence_hint(where: str, tls: Path | None) -> str:
     return f"{hint}, or {unlisted_hint(tls)}"
 
 
-def _realms_of(session: zenoh.Session, service: str) -> list[str]:
-    """Return the realms in which a service of this name answers, at most `_MAX_REALMS`."""
+def realms_hint(realms: Sequence[str]) -> str:
+    """Return in which realms a service answers; empty for none."""
+    return f"it answers with --realm {' or '.join(realms)}" if realms else ""
+
+
+def realms_of(session: zenoh.Session, service: str | None) -> list[str]:
+    """Return the realms in which a service, or any (None), answers, at most `_MAX_REALMS`."""
     found: set[str] = set()
-    with Subscription(session, f"{PREFIX}/*/service/{service}/health") as subscription:
+    with Subscription(session, f"{PREFIX}/*/service/{service or '*'}/health") as subscription:
         deadline_s = time.monotonic() + _ELSEWHERE_S
         while (left_s := deadline_s - time.monotonic()) > 0 and len(found) < _MAX_REALMS:
             received = subscription.receive(left_s)

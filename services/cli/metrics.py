@@ -21,7 +21,7 @@ from schemas.topics import Key, check_identifier, check_realms, key, selector
 from services.bus.playback import stopped_by_signals
 from services.bus.session import open_session, wait_for_router
 from services.bus.subscription import RawSample, Subscription
-from services.cli.health import OLDEST_S, silence_hint
+from services.cli.health import OLDEST_S, realms_hint, realms_of, silence_hint
 from services.common.errors import FailureError, InputError
 
 _log = logging.getLogger(__name__)
@@ -88,12 +88,12 @@ def metrics_command(
             received = subscription.receive(left_s)
             if received is not None and board.add(received):
                 deadline_s = min(deadline_s, time.monotonic() + (_MORE_S if not service else 0.0))
+        elsewhere = [] if board.services(time.time()) else realms_of(session, service)
     found = board.services(time.time())
     if not found:
         who = service or "every service"
-        raise FailureError(
-            f"{who} in realm {realm} sends nothing at {endpoint}; {silence_hint(where, tls)}"
-        )
+        hint = realms_hint(elsewhere) or silence_hint(where, tls)
+        raise FailureError(f"{who} in realm {realm} sends nothing at {endpoint}; {hint}")
     return exposition(found)
 
 

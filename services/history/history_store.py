@@ -151,15 +151,17 @@ def bridges_of(folder: Path) -> dict[tuple[str, str], Path]:
 
 def realm_of(folder: Path, bridge: str, realm: str | None) -> str:
     """Return the realm of a bridge; InputError if it has no such bridge, or in several realms."""
-    realms = [r for r, b in bridges_of(folder) if b == bridge and realm in (None, r)]
+    everywhere = [r for r, b in bridges_of(folder) if b == bridge]
+    realms = [r for r in everywhere if realm in (None, r)]
     if len(realms) == 1:
         return realms[0]
     if realms:
         raise InputError(f"{folder}: {bridge} is in {', '.join(realms)}; choose with --realm")
+    if everywhere:
+        raise InputError(f"{folder}: {bridge} is in {', '.join(everywhere)}, not in {realm}")
     known = sorted({b for _, b in bridges_of(folder)})
     some = ", ".join(known[:8]) + (" …" if len(known) > 8 else "")
-    inside = f" in realm {realm}" if realm else ""
-    raise InputError(f"{folder}: has no bridge {bridge}{inside}; there are {some or 'none'}")
+    raise InputError(f"{folder}: has no bridge {bridge}; there are {some or 'none'}")
 
 
 def read_partition(where: Path, columns: Iterable[str] = ()) -> BridgeRows:

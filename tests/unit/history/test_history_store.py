@@ -353,7 +353,7 @@ def test_history_is_drawn_against_the_baseline_of_a_site_file(
     ("arguments", "line"),
     [
         (["bridge-9"], "has no bridge bridge-9; there are bridge-1"),
-        (["bridge-1", "--realm", "live"], "has no bridge bridge-1 in realm live"),
+        (["bridge-1", "--realm", "live"], "bridge-1 is in sim-fleet, not in live"),
         (["bridge-1", "bridge-2"], "one bridge is expected, or add RESULTS …"),
         (["--sql", "SELECT nothing"], "--sql: "),
         (["--sql", "DROP VIEW crossings"], "SELECT … is expected"),
@@ -377,6 +377,8 @@ def test_a_bridge_in_two_realms_has_to_be_chosen(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="bridge-1 is in live, sim-fleet; choose with --realm"):
         history_store.realm_of(tmp_path, "bridge-1", None)
     assert history_store.realm_of(tmp_path, "bridge-1", "live") == "live"
+    with pytest.raises(InputError, match=r"bridge-1 is in live, sim-fleet, not in sim-typo$"):
+        history_store.realm_of(tmp_path, "bridge-1", "sim-typo")
     assert len(overview(tmp_path).rows) == 2
 
 
