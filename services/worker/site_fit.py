@@ -71,4 +71,4 @@ def _distances_m(places: np.ndarray, latitude_deg: float, longitude_deg: float) 
     latitude, longitude = math.radians(latitude_deg), math.radians(longitude_deg)
     half = np.sin((places - (latitude, longitude)) / 2) ** 2
     chord = half[:, 0] + np.cos(places[:, 0]) * math.cos(latitude) * half[:, 1]
-    return 2 * _EARTH_RADIUS_M * np.arcsin(np.sqrt(np.minimum(chord, 1.0)))
+    return np.asarray(2 * _EARTH_RADIUS_M * np.arcsin(np.sqrt(np.minimum(chord, 1.0))))
