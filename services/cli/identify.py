@@ -304,7 +304,7 @@ def _as_state(bridge: Bridge, state: BridgeResult) -> str:
         for (name, one), ei in zip(state.elements.items(), nominal, strict=True)
     )
     return (
-        f"lowest EI/nominal, with between-crossing variability as in reports: {name} {ratio:.3f} "
+        f"lowest EI/nominal in reports (wider by between-crossing variability): {name} {ratio:.3f} "
         f"({low:.3f} … {high:.3f})"
     )
 
@@ -371,7 +371,7 @@ def _support_lines(derived: Derived, *, torsion_declared: bool) -> Iterator[str]
         yield f"probability that the deck twists: {likely} (50 % if not determined)"
     if derived.springs_believed is not None:
         weight = f"{100.0 * derived.springs_believed:.0f} %"
-        yield f"weight of the body equations: {weight} (low with suspension friction)"
+        yield f"weight of the truck's body equations: {weight} (low with suspension friction)"
 
 
 def _level_lines(crossing: CrossingResult, *, is_stated: bool) -> Iterator[str]:
@@ -382,12 +382,12 @@ def _level_lines(crossing: CrossingResult, *, is_stated: bool) -> Iterator[str]:
     if crossing.road is not None and crossing.road.mismatch is not None:
         mismatch = crossing.road.mismatch
         yield (
-            f"profile mismatch: {mismatch.A_m3:.2g} m³ at long wavelengths, a quarter of that at "
-            f"{mismatch.n_0_per_m:.1f} cycles/m"
+            f"profile mismatch: spectrum {mismatch.A_m3:.2g} m³ at long wavelengths, a quarter of "
+            f"that at {mismatch.n_0_per_m:.1f} cycles/m"
             + (
                 ""
                 if mismatch.bridge_ratio is None
-                else f"; × {mismatch.bridge_ratio:.1f} on the bridge"
+                else f"; amplitude × {mismatch.bridge_ratio:.1f} on the bridge"
             )
         )
 

@@ -133,7 +133,9 @@ def _of_the_others(found: SurveyForecast) -> str:
     if not better:
         other = "No other change of truck, load, direction or sensors helps much."
         return (
-            f"What helps is {TANDEM}, but less than its row states." if is_tandem_advised else other
+            f"What helps is {TANDEM}, but less than its optimistic row states."
+            if is_tandem_advised
+            else other
         )
     first, *rest = better
     is_best = all(first.rank <= one.rank for one in rest)
@@ -144,7 +146,7 @@ def _of_the_others(found: SurveyForecast) -> str:
         how = "What helps more" if more else "Next best"
         sentence += f" {how}: {second.text} (then {second.gain})."
     if is_tandem_advised:
-        sentence += f" {TANDEM.capitalize()} helps, too, but less than its row states."
+        sentence += f" {TANDEM.capitalize()} helps, too, but less than its optimistic row states."
     return sentence
 
 

@@ -135,7 +135,7 @@ def _legend_of_changes(crossings: int, middle: int, *, has_speeds: bool) -> Iter
     yield "mid        standard deviation of EI at midspan; smallest is there, too"
     yield f"needed     crossings that detect the loss at midspan with {wanted} probability"
     yield "ends       crossings that detect it at both ends; other elements lie in between"
-    yield "clear      crossings after which a report calls the loss at midspan clear"
+    yield "report     crossings after which a report calls the loss at midspan clear"
     yield f"–          more than {MAX_CROSSINGS} crossings"
     yield f"midspan: EI_{middle}, at the middle of the longest span"
     yield "equal single tyres: on tracks that are equal to a centimetre"
@@ -144,7 +144,7 @@ def _legend_of_changes(crossings: int, middle: int, *, has_speeds: bool) -> Iter
     yield "in the other direction: in the opposite lane"
     yield "… elements: fewer, longer ones"
     if has_speeds:
-        yield "at … m/s: all runs at one speed; needed, ends and clear are not computed"
+        yield "at … m/s: all runs at one speed; needed, ends and report are not computed"
 
 
 def _not_advised(found: SurveyForecast) -> Iterator[str]:
@@ -200,7 +200,7 @@ def _elements(found: SurveyForecast) -> list[list[str]]:
 
 
 def _comparison(found: SurveyForecast) -> list[list[str]]:
-    rows = [["what if", "overall", "mid", "smallest", "needed", "ends", "clear"]]
+    rows = [["what if", "overall", "mid", "smallest", "needed", "ends", "report"]]
     rows += [_cells(one, one.plan.label) for one in (found.planned, *found.others)]
     rows += [
         [

@@ -25,7 +25,7 @@ class CheckOptions:
         nargs="*",
         metavar="SITE.toml|REC.mcap|DIR",
     )
-    site: Path | None = site_option("site file to check, also as an argument (then a .toml file)")
+    site: Path | None = site_option("site file (.toml) to check, which may also be an argument")
     template: Path | None = output_option(
         "write a commented site file to start from, and check nothing", "NEW.toml"
     )

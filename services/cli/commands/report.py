@@ -50,7 +50,7 @@ class ReportOptions:
     )
     language: str = opt("report language (default: en)", default="en", choices=tuple(LANGUAGES))
     history: Path | None = file_option(
-        "add a page with each bridge over time, from this history", "DIR"
+        "folder of a history; adds a page on each bridge over time", "DIR"
     )
     period: "Unit" = opt(
         "length of the periods whose crossings are fused (default: month)",

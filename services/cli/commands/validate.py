@@ -166,7 +166,8 @@ class ValidateOptions:
         metavar="all|twin,steady,…",
     )
     truth: Path = opt(
-        "parent folder of crossings with a truth.json (default: ../shared/crossings)",
+        "folder of folders with crossings of another simulator and their truth.json "
+        "(default: ../shared/crossings)",
         Path,
         default=Path("../shared/crossings"),
         metavar="DIR",

@@ -211,7 +211,7 @@ def test_tandem_that_does_not_help_is_not_advised() -> None:
     assert NONE_HELPS in advice(forecast((9, 40, 0.2), tandem=(9, 40, 0.19)))
     better = forecast((None, None, 0.5), few=(20, None, 0.3), tandem=(6, 43, 0.17))
     assert advice(better).endswith(
-        f"{TANDEM.capitalize()} helps, too, but less than its row states."
+        f"{TANDEM.capitalize()} helps, too, but less than its optimistic row states."
     )
 
 
