@@ -75,7 +75,7 @@ def test_implausible_stiffness_takes_certainty_from_headline(site: Site) -> None
         "Not plausible: the 95 % interval of element 5 lies entirely more than 20 % above" in text
     )
     assert "treat no value as certain, least of all those of elements 4 and 6" in text
-    assert "All checks passed, but none explains the implausible stiffness" in text
+    assert "All checks passed; they do not explain the implausible stiffness" in text
     assert "If the drawings show nothing stiffer at element 5, check mass" in text
     assert re.search(r"17\.1–21\.4 .{,60} not plausible", text)
     usual = first_page(reported(site, results_of(site, some_crossing("a"), used="a")))

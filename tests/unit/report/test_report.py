@@ -108,7 +108,7 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     assert "A loss that affects all elements equally cannot be detected without a baseline." in text
     # The evidence.
     assert "reduced chi-square (χ²/dof) 1.02 1.02 residuals relative to the declared noise" in text
-    assert "weight of the body equations (%) 100 100 100 %" in text
+    assert "weight of the truck's body equations (%) 100 100 100 %" in text
     assert "rotational restraint (%) 3 and 4 3 and 4 probability" in text
     assert "R-hat 1.004 1.004 agreement" in text
     assert "truck-1 south-west to north-east 10.0 pre good yes" in text
@@ -526,7 +526,7 @@ def test_the_baseline_of_the_site_file_lies_beside_it(
     (tmp_path / "sites" / "then.json").write_bytes(found.read_bytes())
     assert run(capsys, "report", *options)[0] == 0
     assert (
-        "No element has clearly changed (estimated at most 1 %)"
+        "No element has clearly changed (estimated changes: at most 1 %)"
         in (tmp_path / "r.html").read_text()
     )
 
@@ -892,7 +892,7 @@ def test_something_is_to_be_done_about_every_reason() -> None:
 
 def test_state_of_one_crossing_reports_its_wider_intervals(site: Site) -> None:
     one = fused(site, KNOWN, crossings_used=["c"])
-    assert "include the between-crossing variability" in reported(site, one).text
+    assert "include an assumed between-crossing variability" in reported(site, one).text
     alone = results_of(site, some_crossing("a"), used="a")
     assert "between-crossing variability" not in reported(site, alone).text
 
