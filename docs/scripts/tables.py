@@ -356,7 +356,7 @@ def _remedies(old: str) -> str:
         advice = ENGLISH.advice[found[1]]
         paper = ENGLISH.remedy(found[1], "least_squares")
         if paper != advice:
-            advice += f" Methods of the paper: {paper[0].lower()}{paper[1:]}"
+            advice += f" With the paper's methods, {paper[0].lower()}{paper[1:]}"
         return f"| `{found[1]}` | {found[2]} | {advice} |\n"
 
     pattern = r"^\| `(\w+)` \| (.+) \|(?: [^|\n]*)\|\n"
