@@ -99,9 +99,8 @@ def estimate(crossing: CrossingResult) -> BusMessage:
 
 WEAK_FINDING = (
     "Element 4 (12.9 to 17.1 m) is 60 % less stiff than the other elements "
-    "(95 % interval 57 to 62 %). No other element differs clearly (estimated "
-    "differences: at most 3 %). A loss of 16 % in any of these elements is detected with "
-    "95 % probability."
+    "(95 % interval 57 to 62 %). No other element differs clearly (estimates differ "
+    "by up to 3 %). A loss of 16 % in any of these elements is detected with 95 % probability."
 )
 
 
@@ -190,7 +189,7 @@ def a_fleet(site: Site) -> RealmModel:
     drives(watched, "truck-3", ago_s=300.0)
     rng = np.random.default_rng(4)
     quiet = (
-        "No element differs clearly from the others (estimated differences: at most {} %). "
+        "No element differs clearly from the others (estimates differ by up to {} %). "
         "A loss of 14 % in any of these elements is detected with 95 % probability."
     )
     for number, bridge in enumerate(("bridge-02", "bridge-03", "bridge-11", "bridge-07")):

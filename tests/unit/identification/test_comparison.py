@@ -240,9 +240,7 @@ def test_unresolved_elements_are_never_stated_to_agree() -> None:
     ]
     assert describe_comparison(sound, frozenset({7}), without=("detectable", "unresolved")) == []
     (only,) = sentences(sound, without=("detectable",))
-    assert (
-        only == "No element differs clearly from the others (estimated differences: at most 1 %)."
-    )
+    assert only == "No element differs clearly from the others (estimates differ by up to 1 %)."
     both = describe_comparison(found, frozenset({3, 5}))
     assert both[1] == "The loss may also be in the adjacent element 3 or 5."
     every = describe_comparison(sound, frozenset(range(1, 8)))

@@ -526,7 +526,7 @@ def test_the_baseline_of_the_site_file_lies_beside_it(
     (tmp_path / "sites" / "then.json").write_bytes(found.read_bytes())
     assert run(capsys, "report", *options)[0] == 0
     assert (
-        "No element has clearly changed (estimated changes: at most 1 %)"
+        "No element has clearly changed (estimates changed by up to 1 %)"
         in (tmp_path / "r.html").read_text()
     )
 
