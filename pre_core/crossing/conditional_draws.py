@@ -47,7 +47,7 @@ that a smaller determinant adds."""
 
 
 class ConditionalDraws(NamedTuple):
-    """Weighted draws (k, f) of all coordinates, and the evaluations that they took."""
+    """Weighted draws (k, f) of all coordinates, and the number of evaluations that they took."""
 
     weighted: WeightedDraws
     evaluations: int

@@ -40,7 +40,7 @@ _STEP = 1e-3
 class ExpectedSquares(NamedTuple):
     """Half the expected squares of the noise of a problem's residuals, about an optimum.
 
-    Gains and torsion change them in proportion, and are left to the tangent.
+    Gains and torsion change them only in proportion, so for these the tangent suffices.
     """
 
     problem: PosteriorProblem

@@ -39,7 +39,7 @@ from pre_core.search.levenberg_marquardt import minimise
 
 _STAGES_HZ = (1.5, 3.0, 6.0, 12.0, 24.0)
 _STEPS, _LAST_STEPS = 10, 20
-"""Limits of the steps of a stage, and of the fit to all frequencies after them."""
+"""Largest numbers of steps: of one stage, and of the fit to all frequencies after the stages."""
 ENOUGH = 0.5
 """Improvement of the sum of squares that ends a stage, and that another bridge must promise."""
 _RIVAL = 20.0

@@ -18,7 +18,8 @@ wrong span or an undeclared support acted on the bridge it was 1.0. With full we
 body equations and one profile it was 25 or more where springs or profiles of fault-free
 crossings needed another model."""
 _MAX_REPEATS, _CLEARLY_LESS = 4, 0.8
-"""Limit of repeated fits, and the chi2 relative to the last one that another fit must reach."""
+"""Largest number of repeated fits, and the chi2 relative to the previous fit's that each must
+reach."""
 _MAX_REPEATED_CHI2 = 500.0
 """Value of `OffBridgeFit.chi2` above which the noise of another truck explains nothing."""
 _STEPS, _IMPROVEMENT = 12, 10.0

@@ -40,7 +40,7 @@ fusion keeps."""
 
 
 class ResidualParts(NamedTuple):
-    """The coordinates and residuals of a crossing that are distinguished from its nuisances."""
+    """Coordinates and residuals of a crossing that remain when its nuisances are integrated out."""
 
     curved: NDArray[np.int64]
     """Indices (n,) in y of the coordinates whose effect is not linear, without the offset."""
@@ -55,7 +55,7 @@ class ResidualParts(NamedTuple):
 
 
 class Nuisances(NamedTuple):
-    """Nuisances of a crossing, which follow its curved coordinates and offset (n + 1,).
+    """Nuisance coordinates of a crossing, which follow its curved coordinates and offset (n + 1,).
 
     Residuals (m + r + 1,) include r priors of the mixture of initial vibrations, and the expected
     squares of the noise.

@@ -50,7 +50,7 @@ to 22 at the first one tried; with a skew plate it was 4,500."""
 
 
 def refined(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> tuple[Optimum, int]:
-    """Return the best of an optimum and those that follow from it, and the evaluations."""
+    """Return the best of an optimum and those that follow from it, and count evaluations."""
     if _is_sharp(found):
         return _with_other_bridge(found, strategy, max_evaluations)
     return _refine_offset(found, strategy, max_evaluations)
@@ -59,7 +59,7 @@ def refined(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> t
 def about_truck(
     found: Optimum, y: FloatArray, strategy: SearchStrategy, max_evaluations: int
 ) -> tuple[Optimum | None, int]:
-    """Return the best optimum of bridges about a truck at y (f,), and the evaluations.
+    """Return the best optimum of bridges about a truck at y (f,), and count evaluations.
 
     The truck explains the residuals off the bridge, where no bridge acts, so a misfit of `found`
     may be due to a bridge that vibrates at another frequency. Bridges of other frequencies are
@@ -89,7 +89,7 @@ def about_truck(
 def _best_bridge(
     best: Optimum, strategy: SearchStrategy, max_evaluations: int
 ) -> tuple[Optimum, int]:
-    """Return the best of `best` and optima of other bridges about it, and the evaluations.
+    """Return the best of `best` and optima of other bridges about it, and count evaluations.
 
     They are tried again about each better one: the bridge next to a wrong one may be the true one.
     """
@@ -127,7 +127,7 @@ def _chi2_at_full_weight(found: Optimum) -> float:
 def _fits_about(
     around: Optimum, strategy: SearchStrategy, tried: int, *, is_even: bool
 ) -> tuple[list[Optimum], int]:
-    """Return fits of all parameters from `tried` other bridges at most, and the evaluations.
+    """Return fits of all parameters from `tried` other bridges at most, and count evaluations.
 
     They are completed up to `_COMPLETED_CHI2`; an accepted one is the last.
     """
@@ -183,7 +183,7 @@ def _is_sharp(found: Optimum) -> bool:
 def _with_other_bridge(
     found: Optimum, strategy: SearchStrategy, max_evaluations: int
 ) -> tuple[Optimum, int]:
-    """Return the best of an optimum and those of other bridges, and the evaluations."""
+    """Return the best of an optimum and those of other bridges, and count evaluations."""
     evaluations = 0
     rivals: list[OtherBridge] = []
     failed, is_even = 0, True
@@ -207,7 +207,7 @@ def _with_other_bridge(
 def _refine_offset(
     found: Optimum, strategy: SearchStrategy, max_evaluations: int
 ) -> tuple[Optimum, int]:
-    """Return the best of an optimum and, with mismatch, its neighbours; and the evaluations."""
+    """Return the best of an optimum and, with mismatch, its neighbours; count evaluations."""
     evaluations = 0
     for _ in range(_MAX_MOVES):
         if evaluations > max_evaluations or not found.problem.mismatch.level_m3.any():
@@ -245,11 +245,11 @@ def with_full_weight(found: Optimum, strategy: SearchStrategy, max_evaluations: 
 
 
 def with_free_ends(found: Optimum, strategy: SearchStrategy) -> tuple[Optimum, int]:
-    """Return the better optimum, with rotational restraints or without, and the evaluations.
+    """Return the better optimum, with rotational restraints or without, and count evaluations.
 
     A bridge restrained at both ends with less than half its stiffness deflects nearly as one on
-    free bearings, with a truck that is wrong by a third of its prior: a search that gets there
-    stays there. Fits of `other_bridges` have such starts already.
+    free bearings, with a truck that is wrong by a third of its prior's standard deviation: a search
+    that gets there stays there. Fits of `other_bridges` have such starts already.
     """
     where, y = layout(found.problem), found.state.y
     ends = np.intersect1d(where.half_normal, where.bridge)

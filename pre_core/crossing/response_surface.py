@@ -19,7 +19,7 @@ from pre_core.crossing.nuisances import Nuisances, integrated_residuals, unexpla
 POINTS, POINTS_OF_DRAWS = 1920, 960
 """Numbers of points to which a surface is fitted: for fusion (fourteen for each of its
 coefficients), and for a single crossing. Fewer or repeated points leave so much of the third-order
-remainder in the slopes that other points move fused elements by twice their width.
+remainder in the slopes that other points move a fused EI by twice its standard deviation.
 """
 _TOGETHER = 160
 """Number of points evaluated together: their residuals take some ten megabytes."""

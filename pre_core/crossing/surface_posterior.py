@@ -92,12 +92,12 @@ class SurfacePosterior(NamedTuple):
 
 
 def nuisances_at_optimum(found: Optimum, inflation: float, seed: int) -> Nuisances:
-    """Return a crossing's nuisances, with the mixture of bridges of the normal at its optimum."""
+    """Return a crossing's nuisances, for bridges drawn from the normal about its optimum."""
     return nuisances_on(found, _points_of_normal(found, _FIRST_POINTS, inflation, seed))
 
 
 def nuisances_on(found: Optimum, points: FloatArray) -> Nuisances:
-    """Return a crossing's nuisances, with the mixture of bridges of points (k, n + 1)."""
+    """Return a crossing's nuisances, for the bridges of points (k, n + 1)."""
     problem, curved = found.problem, curved_coordinates(found)
     rows = compliances.without_priors(problem, found.state.residual.size, curved)
     none = np.zeros((rows.size, 0))

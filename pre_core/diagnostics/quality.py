@@ -149,7 +149,7 @@ class ChannelAssignment(NamedTuple):
     best: float
     """Unexplained share of the best other assignment."""
     best_order: tuple[int, int, int, int]
-    """Channels of that assignment: sprung front, sprung rear, unsprung front, unsprung rear."""
+    """Channels of the best other assignment: sprung front and rear, unsprung front and rear."""
 
 
 def assign_channels(

@@ -33,7 +33,7 @@ class RedundancyResidual(NamedTuple):
     expected: float
     """Sum of squares that noise, gains and delays cause at `slack` standard deviations."""
     motion: float
-    """Sum of squares if all sensors moved independently."""
+    """Sum of squares that the combinations would have if all sensors moved independently."""
     unexplained: FloatArray
     """Share (m,) of the power that a gain error and a delay of this sensor alone do not explain;
     NaN for sensors outside the part."""

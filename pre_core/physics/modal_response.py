@@ -79,7 +79,7 @@ def _ramp_response(time: float, damping: float, eigenvalue: float) -> float:
 
 @kernel
 def mode_coefficients(eigenvalue: float, damping: float, step: float, out: FloatArray) -> float:
-    """Write the coefficients (5,) of one mode (see COEFFICIENTS); return the sum of the b."""
+    """Write the coefficients (5,) of one mode (see COEFFICIENTS); return b_0 + b_1 + b_2."""
     half = 0.5 * damping
     square = eigenvalue - half * half
     if square > 0.0:

@@ -77,7 +77,10 @@ def torsion_basis(
 
 
 def span_ends_m(part_lengths_m: FloatArray, supports: tuple[int, ...]) -> FloatArray:
-    """Return the chainages (spans, 2) of each span's ends for parts (parts,) and interior nodes."""
+    """Return the chainages (spans, 2) of the spans' ends, for the lengths (parts,) of the elements.
+
+    `supports` are the numbers of elements before the interior supports.
+    """
     edges = np.concatenate([[0.0], np.cumsum(part_lengths_m)])
     held = edges[[0, *supports, part_lengths_m.size]]
     return np.stack([held[:-1], held[1:]], axis=1)

@@ -50,7 +50,7 @@ class LatentCoordinates(NamedTuple):
         return share
 
     def unexplained(self, values: FloatArray) -> FloatArray:
-        """Return the changes (b, n) of v for changes (b, n) of positive values: v is linear."""
+        """Return the changes (b, n) of v for changes (b, n) of values that stay positive."""
         return np.asarray(values - self.follow @ values[self.places])
 
 
