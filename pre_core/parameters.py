@@ -5,7 +5,7 @@ element. To add a parameter, add a row here and its effect in `physics` (and the
 it transmits, `crossing/noise`); priors, search, results and validation follow from the row.
 """
 
-from functools import cache
+from functools import cache, partial
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -41,6 +41,8 @@ class ParameterSpec(NamedTuple):
     in_paper: bool = True
 
 
+_possible = partial(ParameterSpec, may_be_zero=True, may_be_absent=True, in_paper=False)
+
 SCALARS: Final = (
     ParameterSpec("d_1", "m", TRUCK, "front_axle_to_cg_m"),
     ParameterSpec("c_s1", "N·s/m", TRUCK, "suspension_damping_ns_per_m", 0, 1),
@@ -62,61 +64,11 @@ SCALARS: Final = (
     ParameterSpec("rhoA", "kg/m", BRIDGE, "mass_per_length_kg_per_m", 0, 1),
     ParameterSpec("alpha", "1/s", BRIDGE, "rayleigh_alpha_per_s"),
     ParameterSpec("beta", "s", BRIDGE, "rayleigh_beta_s"),
-    ParameterSpec(
-        "k_rot_start",
-        "N·m/rad",
-        BRIDGE,
-        "support_rotational_stiffness_nm_per_rad",
-        0,
-        1,
-        may_be_zero=True,
-        may_be_absent=True,
-        in_paper=False,
-    ),
-    ParameterSpec(
-        "k_rot_end",
-        "N·m/rad",
-        BRIDGE,
-        "support_rotational_stiffness_nm_per_rad",
-        1,
-        1,
-        may_be_zero=True,
-        may_be_absent=True,
-        in_paper=False,
-    ),
-    ParameterSpec(
-        "f_start",
-        "m/N",
-        BRIDGE,
-        "support_compliance_m_per_n",
-        0,
-        -1,
-        may_be_zero=True,
-        may_be_absent=True,
-        in_paper=False,
-    ),
-    ParameterSpec(
-        "f_end",
-        "m/N",
-        BRIDGE,
-        "support_compliance_m_per_n",
-        1,
-        -1,
-        may_be_zero=True,
-        may_be_absent=True,
-        in_paper=False,
-    ),
-    ParameterSpec(
-        "torsion",
-        "1/N",
-        BRIDGE,
-        "torsional_flexibility_per_n",
-        0,
-        -1,
-        may_be_zero=True,
-        may_be_absent=True,
-        in_paper=False,
-    ),
+    _possible("k_rot_start", "N·m/rad", BRIDGE, "support_rotational_stiffness_nm_per_rad", 0, 1),
+    _possible("k_rot_end", "N·m/rad", BRIDGE, "support_rotational_stiffness_nm_per_rad", 1, 1),
+    _possible("f_start", "m/N", BRIDGE, "support_compliance_m_per_n", 0, -1),
+    _possible("f_end", "m/N", BRIDGE, "support_compliance_m_per_n", 1, -1),
+    _possible("torsion", "1/N", BRIDGE, "torsional_flexibility_per_n", 0, -1),
 )
 """All rows except EI, in the order of theta."""
 ELEMENT: Final = ParameterSpec("EI", "N·m²", BRIDGE, "flexural_rigidity_nm2", 0, 1)

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.arrays import FloatArray
-from pre_core.crossing.copula import copula_draws
+from pre_core.crossing.surface_posterior import copula_draws
 
 
 def ranks(columns: FloatArray) -> NDArray[np.int64]:
