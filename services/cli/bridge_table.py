@@ -72,16 +72,14 @@ def print_bridge(
     used, left = len(state.crossings_used), state.crossings_left_out_count
     console.print(
         f"[bold]{bridge.id}[/], {count_of(used, 'crossing')} fused"
-        + (f", {left} excluded" if left else ""),
-        highlight=False,
+        + (f", {left} excluded" if left else "")
     )
     for one in state.crossings_left_out:
         console.print(
             f"  {one.crossing_id}: {LEFT_OUT_TEXTS.get(one.reason, one.reason)}",
-            highlight=False,
             soft_wrap=True,
         )
-    console.print(f"measurement [bold]{state.verdict}[/]", highlight=False)
+    console.print(f"measurement [bold]{state.verdict}[/]")
     print_reasons(console, state.reasons, state.reason_texts, ENGLISH.bridge_advice)
     if not state.elements:
         return
@@ -91,9 +89,9 @@ def print_bridge(
     if state.finding is not None:
         print_finding(console, bridge, state)
         if state.probability_of_loss is None and len(_days(state)) > 1:
-            console.print(_NO_CHANGE, highlight=False)
+            console.print(_NO_CHANGE)
     for line in _of_state(state, crossings):
-        console.print(line, highlight=False)
+        console.print(line)
 
 
 def print_reasons(
@@ -106,19 +104,19 @@ def print_reasons(
         if remedy is not None and remedy not in map(remedies.get, codes[:number]):
             lines.append(f"    {remedy}")
         for line in lines:
-            console.print(line, highlight=False, markup=False)
+            console.print(line, markup=False)
 
 
 def print_finding(console: "Console", bridge: BridgeElements, state: BridgeResult) -> None:
     """Print the finding of a state; without a baseline also what it cannot find."""
-    console.print(f"[bold]the bridge:[/] {state.finding}", highlight=False)
+    console.print(f"[bold]the bridge:[/] {state.finding}")
     if state.probability_of_loss is not None:
         return
     nominal, lengths = map(np.array, (bridge.nominal_flexural_rigidity_nm2, bridge.lengths_m))
     unresolved = unresolved_elements(state.elements.values())
     lower = possibly_weak(compared(state, nominal, lengths), unresolved)
     for line in (*describe_possibly_weak(lower), _NO_BASELINE):
-        console.print(line, highlight=False)
+        console.print(line)
 
 
 def _days(state: BridgeResult) -> set[date]:

@@ -148,7 +148,7 @@ def _wait_until_closed(view: "_ChildProcess", console: "Console") -> None:
     notice = "The live view stays until its window is closed, or Ctrl-C."
     if address is not None:
         notice = f"The live view stays until Ctrl-C, at {address[1]}"
-    console.print(f"\n{notice}", highlight=False, soft_wrap=True)
+    console.print(f"\n{notice}", soft_wrap=True)
     code: int | None = None
     with contextlib.suppress(KeyboardInterrupt):
         code = view.process.wait()
@@ -382,18 +382,16 @@ def _print(console: "Console", crossing: CrossingResult, drive: SimulatedDrive, 
         share = 100.0 * (1.0 - _INTERVAL ** len(nominal))
         console.print(
             f"Of {len(nominal)} intervals (95 %) at least one misses the truth "
-            f"in {share:.0f} % of crossings.",
-            highlight=False,
+            f"in {share:.0f} % of crossings."
         )
     if not has_meaning:
         console.print(
-            "* The method least-squares has no noise model, so its uncertainty is unknown.",
-            highlight=False,
+            "* The method least-squares has no noise model, so its uncertainty is unknown."
         )
     if not crossing.reasons:
-        console.print(f"verdict {crossing.verdict}", highlight=False)
+        console.print(f"verdict {crossing.verdict}")
     for code, text in zip(crossing.reasons, crossing.reason_texts, strict=True):
-        console.print(f"verdict {crossing.verdict} ({code}): {text}", highlight=False)
+        console.print(f"verdict {crossing.verdict} ({code}): {text}")
 
 
 def _print_outputs(console: "Console", folder: Path, seconds: float) -> None:
@@ -405,4 +403,4 @@ def _print_outputs(console: "Console", folder: Path, seconds: float) -> None:
         f"  {_FIGURE:<16} figure of flexural rigidity and road profiles",
     ]
     for line in lines:
-        console.print(line, highlight=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)

@@ -44,8 +44,7 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
     if again:
         console.print(
             f"{count_of(again, 'result')} of crossings that are also in another file; the newest "
-            "result of a crossing counts",
-            highlight=False,
+            "result of a crossing counts"
         )
     stored = _baselines(baseline, asked.site)
     with parts_bar("fusing bridge", len(found.by_bridge), console) as report:
@@ -57,9 +56,7 @@ def fuse_command(asked: FuseOptions, console: "Console") -> int:
             fuse_suspect=asked.fuse_suspect,
         )
     for name, number in fused.unfused.items():
-        console.print(
-            f"{name}: none of its {count_of(number, 'crossing')} can be fused", highlight=False
-        )
+        console.print(f"{name}: none of its {count_of(number, 'crossing')} can be fused")
     for number, (name, elements) in enumerate(fused.bridges.items()):
         if number > 0:
             console.print()
@@ -109,7 +106,6 @@ def _print_validations(
             console.print(
                 f"{pair}: the results name no passed site validation; "
                 "give --site SITE.toml to search for its record",
-                highlight=False,
                 soft_wrap=True,
             )
     else:

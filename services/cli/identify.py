@@ -102,7 +102,7 @@ def identify_command(
         with steps_bar(f"drawing into {asked.figures}", console) as drawn:
             written = write_pictures(asked.figures, found, known, drawn, request.fusing.baselines)
         line = f"{count_of(len(written), 'picture')} in {asked.figures}"
-        console.print(line, highlight=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
     if asked.draws is not None:
         drawn = [crossing for crossing in found.crossings if crossing.crossing_id in draws]
         kept = (
@@ -264,7 +264,7 @@ def _crossings_seen(recordings: list[Path], site: Site, console: "Console") -> i
 def _print(console: "Console", found: Results, site: Site) -> None:
     if not found.crossings:
         bridges = ", ".join(bridge.id for bridge in site.bridges)
-        console.print(f"no crossing of a known bridge ({bridges})")
+        console.print(f"no crossing of a known bridge ({bridges})", highlight=True)
         return
     crossed = Counter(crossing.bridge for crossing in found.crossings)
     alone = {
@@ -282,7 +282,7 @@ def _print(console: "Console", found: Results, site: Site) -> None:
             console.print()
             print_bridge(console, site.bridge(name), state, found.crossings)
         elif state.between_crossing_std is not None:
-            console.print(_as_state(site.bridge(name), state), highlight=False)
+            console.print(_as_state(site.bridge(name), state))
             print_finding(console, site.bridge(name), state)
 
 
@@ -293,7 +293,7 @@ def print_validation(console: "Console", found: Results, site: Site, folder: Pat
     pairs = ValidatedPairs(found.crossings)
     for bridge in dict.fromkeys(crossing.bridge for crossing in found.crossings):
         for note in pairs.notes(folder, site, bridge):
-            console.print(f"[bold]{bridge}:[/] {escape(note)}", highlight=False, soft_wrap=True)
+            console.print(f"[bold]{bridge}:[/] {escape(note)}", soft_wrap=True)
 
 
 def _as_state(bridge: Bridge, state: BridgeResult) -> str:
@@ -318,10 +318,9 @@ def _print_crossing(
     console.print(
         f"[bold]{crossing.crossing_id}[/]\n"
         f"{crossing.vehicle} over {crossing.bridge}, {crossing.direction.replace('_', ' ')}, "
-        f"{crossing.speed_m_per_s:.2f} m/s, method {method}",
-        highlight=False,
+        f"{crossing.speed_m_per_s:.2f} m/s, method {method}"
     )
-    console.print(f"verdict [bold]{crossing.verdict}[/]", highlight=False)
+    console.print(f"verdict [bold]{crossing.verdict}[/]")
     remedies = {code.value: ENGLISH.remedy(code, crossing.method) for code in crossing.reasons}
     print_reasons(console, crossing.reasons, crossing.reason_texts, remedies)
     if crossing.parameters is None:
@@ -339,13 +338,12 @@ def _print_crossing(
     if unresolved:
         console.print(
             f"[bold]not resolved: {', '.join(unresolved)}[/] (standard deviation above "
-            f"{100.0 * RESOLVED:.0f} %)",
-            highlight=False,
+            f"{100.0 * RESOLVED:.0f} %)"
         )
     for line in _fit_lines(crossing, is_level_stated=is_level_stated):
-        console.print(line, highlight=False)
+        console.print(line)
     for remark in bridge_remarks([crossing]):
-        console.print(f"[bold]remark:[/] {escape(remark)}", highlight=False, soft_wrap=True)
+        console.print(f"[bold]remark:[/] {escape(remark)}", soft_wrap=True)
 
 
 def _below(derived: Derived) -> dict[str, dict[str, float]] | None:

@@ -190,7 +190,7 @@ def _print_summary(
     console: "Console",
 ) -> int:
     def write(line: str) -> None:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        console.print(line, markup=False, soft_wrap=True)
 
     for number, (name, state) in enumerate(found.bridges.items()):
         if number == _MAX_BRIDGES:

@@ -145,11 +145,11 @@ def files_of(options: argparse.Namespace) -> Files:
 
 
 def a_console() -> "Console":
-    """Return a console for the output of commands; in a file or a pipe no sentence is wrapped."""
+    """Return a console without highlights; in a file or a pipe no sentence is wrapped."""
     from rich.console import Console
 
     class PipeConsole(Console):
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError  # Rich would exit with 1, a failure
 
-    return PipeConsole(soft_wrap=not sys.stdout.isatty())
+    return PipeConsole(soft_wrap=not sys.stdout.isatty(), highlight=False)

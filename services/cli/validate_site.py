@@ -83,13 +83,13 @@ def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
             if not certificate.passed:
                 failed.add(truck_to_try(known.vehicle(pair.vehicle), known.bridge(pair.bridge)))
                 tried += certificate.crossings
-            console.print(line_of(certificate, path, known), highlight=False, soft_wrap=True)
+            console.print(line_of(certificate, path, known), soft_wrap=True)
     if failed:
         kind = min(failed, key=TRUCK_CHOICES.index)
         remedy = ENGLISH.text(f"caution.try.{kind}")
         advice = _AFTER_FAILURE.format(remedy=remedy)
         lines = " ".join(filter(None, (frequent_reasons(tried), advice)))
-        console.print(lines, highlight=False, soft_wrap=True)
+        console.print(lines, soft_wrap=True)
     return int(bool(failed))
 
 

@@ -102,8 +102,7 @@ def _simulate_plane(
     times = drives[0].run.accel_time_s
     console.print(
         f"{asked.output}: {schedule.in_words(times[-1] - times[0])}, {messages} messages"
-        f"{road_note(known, road_class)}",
-        highlight=False,
+        f"{road_note(known, road_class)}"
     )
     return 0
 

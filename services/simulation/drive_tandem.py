@@ -87,8 +87,7 @@ def simulate_tandem(
     times = runs[0].accel_time_s
     console.print(
         f"{output}: {how.schedule.in_words(times[-1] - times[0])}, {messages} messages"
-        f"{road_note(site, how.road[0])}",
-        highlight=False,
+        f"{road_note(site, how.road[0])}"
     )
     return 0
 
