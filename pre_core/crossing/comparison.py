@@ -18,7 +18,11 @@ def is_better(one: Optimum, other: Optimum) -> bool:
     Misfits, and fits with forces of different form (from inertia or from springs), whose residuals
     are not the same quantities, are compared by chi2.
     """
-    if _is_comparable(one, other):
+    if (
+        one.problem.crossing.is_inertial == other.problem.crossing.is_inertial
+        and one.problem.lines_hz == other.problem.lines_hz
+        and all(is_accepted(each.problem, each.chi2_per_dof) for each in (one, other))
+    ):
         return minus_two_log_posterior(one) < minus_two_log_posterior(other)
     return one.chi2_per_dof < other.chi2_per_dof
 
@@ -32,11 +36,3 @@ def minus_two_log_posterior(found: Optimum) -> float:
     problem = found.problem
     (rows,) = all_rows(problem._replace(noise_slope=np.zeros(0)), found.state.y[None, :])
     return float(rows @ rows) - 2.0 * float(np.log(problem.noise.reciprocal).sum())
-
-
-def _is_comparable(one: Optimum, other: Optimum) -> bool:
-    return (
-        one.problem.crossing.is_inertial == other.problem.crossing.is_inertial
-        and one.problem.lines_hz == other.problem.lines_hz
-        and all(is_accepted(each.problem, each.chi2_per_dof) for each in (one, other))
-    )

@@ -171,6 +171,19 @@ def id_option(default: str) -> Any:
     return opt(text, flags=("--id",), default=default)
 
 
+def count_option(
+    text: str,
+    what: str,
+    default: int,
+    low: int = 0,
+    high: int = (1 << 63) - 1,
+    group: str = "",
+) -> Any:
+    """Return an option with a whole number from `low` to `high`; `what` is for its error."""
+    text = f"{text} (default: {default})"
+    return opt(text, whole(what, low, high), group=group, default=default, metavar="N")
+
+
 def noise_option(text: str, default: float | None = 0.0) -> Any:
     """Return `--noise` of the accelerometers."""
     parse = number("a noise density", low=0, high=1e6)

@@ -245,7 +245,7 @@ def disagreement(
     def judged(parity: Floats, signals: Floats) -> RedundancyResidual:
         return redundancy_residual(parity, signals, step_s, *spreads, _SLACK)
 
-    for parity in _unit_parities(vehicle):
+    for parity in tuple(parity / MICRO_G_M_PER_S2 for parity in reduction_of(vehicle).parities):
         found = judged(parity, acceleration)
         if found.power <= found.expected:
             continue
@@ -280,11 +280,6 @@ def _signed(value: float) -> str:
     """Return a number with its sign and one decimal; 0.0 without a sign."""
     text = f"{value:+.1f}"
     return "0.0" if float(text) == 0.0 else text
-
-
-def _unit_parities(vehicle: Vehicle) -> tuple[Floats, ...]:
-    """Return the parities for accelerations in m/s²; for sensors without noise at 1 µg/√Hz."""
-    return tuple(parity / MICRO_G_M_PER_S2 for parity in reduction_of(vehicle).parities)
 
 
 def _are_mirrored(one: PlacedSensor, other: PlacedSensor) -> bool:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from services.common.options import flag, names, opt, positional, whole
+from services.common.options import count_option, flag, names, opt, positional
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,12 +30,7 @@ class CertsSettings:
         nargs="+",
         metavar="NAME",
     )
-    days: int = opt(
-        "validity of the new certificates in days (default: 365)",
-        whole("days", 1, 3650),
-        default=365,
-        metavar="N",
-    )
+    days: int = count_option("validity of the new certificates in days", "days", 365, 1, 3650)
     renew: Sequence[str] = opt(
         "names that get a new key and certificate", names, default=(), metavar="NAME,…"
     )

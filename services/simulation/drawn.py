@@ -28,7 +28,7 @@ from pre_core.physics.vehicle import HalfCar
 from schemas.reasons import Reason
 from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
-from schemas.site import Bridge, Sensor, Site, Vehicle
+from schemas.site import Bridge, Site, Vehicle
 from services.common.arrays import Floats
 from services.drives.runs import Run, run_to_messages
 from services.finding.crossing_data import CrossingData
@@ -197,7 +197,12 @@ def draw_truth(site: Site, seed: int, mass_score: float | None = None) -> Crossi
         ),
         rayleigh_beta_s=log_normal(bridge.rayleigh_beta_s, bridge.spread("rayleigh_beta_s")),
     )
-    channels = _draw_channels(site.sensor, rng)
+    channels = ChannelErrors(
+        float(site.sensor.common_gain_spread * rng.standard_normal()),
+        site.sensor.gain_spread * rng.standard_normal(4),
+        site.sensor.delay_spread_s * rng.standard_normal(4),
+        _BIAS_M_PER_S2 * rng.standard_normal(4),
+    )
     receiver = site.receiver
     latency = receiver.latency_s + receiver.latency_spread_s * float(rng.standard_normal())
     conditions = _draw_conditions(vehicle, rng)
@@ -235,15 +240,6 @@ def _with_supports(
             at_end(parameters.F, compliances[0]),
             at_end(parameters.F + 1, compliances[1]),
         ),
-    )
-
-
-def _draw_channels(sensor: Sensor, rng: np.random.Generator) -> ChannelErrors:
-    return ChannelErrors(
-        float(sensor.common_gain_spread * rng.standard_normal()),
-        sensor.gain_spread * rng.standard_normal(4),
-        sensor.delay_spread_s * rng.standard_normal(4),
-        _BIAS_M_PER_S2 * rng.standard_normal(4),
     )
 
 

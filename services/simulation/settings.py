@@ -1,10 +1,12 @@
 """Options of `driveby simulate`."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from services.common.options import (
+    count_option,
     flag,
     force_option,
     noise_option,
@@ -22,7 +24,9 @@ _TRUTH: Final = "truth"
 _RECEIVER: Final = "receiver"
 _RUNS: Final = "several runs"
 _SURFACE: Final = "2-D road surface"
+_of_surface = partial(opt, group=_SURFACE)
 _BEYOND: Final = "further effects (default: none, or the site's)"
+_beyond = partial(opt, group=_BEYOND)
 
 
 def _ratios(text: str) -> tuple[float, ...]:
@@ -94,29 +98,30 @@ class SimulateOptions:
         number("a rate in Hz", low=50, high=50_000),
         metavar="HZ",
     )
-    runs: int = opt(
-        "number of runs over the same road, ten minutes apart, in one recording (default: 1)",
-        whole("a number of runs", 1, 100),
+    runs: int = count_option(
+        "number of runs over the same road, ten minutes apart, in one recording",
+        "a number of runs",
+        1,
+        1,
+        100,
         group=_RUNS,
-        default=1,
-        metavar="N",
     )
-    days: int = opt(
-        "number of days, each with these runs, in one recording (default: 1)",
-        whole("a number of days", 1, 1000),
+    days: int = count_option(
+        "number of days, each with these runs, in one recording",
+        "a number of days",
+        1,
+        1,
+        1000,
         group=_RUNS,
-        default=1,
-        metavar="N",
     )
     start: str | None = opt(
         "start of the first run, ISO 8601 with a zone (default: 2026-01-01T00:00:00Z)",
         group=_RUNS,
         metavar="TIME",
     )
-    drive_seed: int | None = opt(
+    drive_seed: int | None = _of_surface(
         "seed of noise and lateral position (default: --seed; the road always uses --seed)",
         whole("a seed", 0),
-        group=_SURFACE,
         metavar="SEED",
     )
     road_surface: bool = flag(
@@ -124,59 +129,51 @@ class SimulateOptions:
         "(default: one profile for both)",
         group=_SURFACE,
     )
-    tyres: str | None = opt(
+    tyres: str | None = _of_surface(
         "tyres of the rear axle, on a 2-D surface (default: the site's, or twin)",
-        group=_SURFACE,
         choices=("single", "twin"),
     )
-    rear_offset: float | None = opt(
+    rear_offset: float | None = _of_surface(
         "lateral offset of the rear from the front axle in m, on a 2-D surface (default: "
         "the site's, or 0.005)",
         number("an offset in m", low=-1, high=1),
-        group=_SURFACE,
         metavar="M",
     )
-    wander: float | None = opt(
+    wander: float | None = _of_surface(
         "lateral wander: standard deviation of the lateral position between runs in m, on a 2-D "
         "surface (default: 0)",
         number("a standard deviation in m", low=0, high=2),
-        group=_SURFACE,
         metavar="M",
     )
-    deck_roughness: float | None = opt(
+    deck_roughness: float | None = _of_surface(
         "roughness on the bridge relative to that off it, on a 2-D surface (default: 1)",
         number("a factor", low=0.1, high=10),
-        group=_SURFACE,
         metavar="FACTOR",
     )
-    joints: float | None = opt(
+    joints: float | None = _of_surface(
         "largest height in mm of a dip or step at each end of the bridge, on a 2-D surface "
         "(default: 0)",
         number("a height in mm", low=0, high=50),
-        group=_SURFACE,
         metavar="MM",
     )
-    anisotropy: float | None = opt(
+    anisotropy: float | None = _of_surface(
         "lateral correlation length relative to that of an isotropic surface, on a 2-D "
         "surface (default: 1)",
         number("a factor", low=0.2, high=20),
-        group=_SURFACE,
         metavar="FACTOR",
     )
-    support_springs: tuple[float, float] = opt(
+    support_springs: tuple[float, float] = _beyond(
         "rotational stiffness of the supports in N·m/rad",
         numbers("rotational stiffnesses in N·m/rad (START:END)", (0, 1e13), (0, 1e13)),
-        group=_BEYOND,
         default=(0.0, 0.0),
         metavar="START:END",
     )
-    bearing_stiffness: tuple[float, float] | None = opt(
+    bearing_stiffness: tuple[float, float] | None = _beyond(
         "vertical stiffness of the bearings in N/m",
         numbers("vertical stiffnesses in N/m (START:END)", (1e7, 1e15), (1e7, 1e15)),
-        group=_BEYOND,
         metavar="START:END",
     )
-    departed_vehicle: tuple[float, float, float] | None = opt(
+    departed_vehicle: tuple[float, float, float] | None = _beyond(
         "weight in N and speed in m/s of a vehicle that left the bridge S seconds before the truck"
         " entered it",
         numbers(
@@ -185,50 +182,43 @@ class SimulateOptions:
             (0.5, 60),
             (0, 1000),
         ),
-        group=_BEYOND,
         metavar="N:M_PER_S:S",
     )
-    friction: float = opt(
+    friction: float = _beyond(
         "suspension friction as a share of the static load",
         number("a share of the springs' load", low=0, high=0.5),
-        group=_BEYOND,
         default=0.0,
         metavar="SHARE",
     )
-    friction_growth: float = opt(
+    friction_growth: float = _beyond(
         "share of the friction that grows with the load; 1: proportional",
         number("a growth with the load", low=0, high=1),
-        group=_BEYOND,
         default=0.0,
         metavar="SHARE",
     )
-    bilinear: float = opt(
+    bilinear: float = _beyond(
         "damper asymmetry: stronger in rebound, weaker in compression by this share",
         number("a share", low=0, high=0.9),
-        group=_BEYOND,
         default=0.0,
         metavar="SHARE",
     )
-    air_springs: float = opt(
+    air_springs: float = _beyond(
         "polytropic exponent of air springs; 1.38 is typical",
         number("a polytropic exponent", low=1, high=2),
-        group=_BEYOND,
         default=0.0,
         metavar="EXPONENT",
     )
-    lane_offset: float | None = opt(
+    lane_offset: float | None = _beyond(
         "distance of the lane's centre line from the bridge's axis in m, positive to the left "
         "looking from start to end; with --torsion the load of this lane twists the deck "
         "(default: the site's, or 0)",
         number("a distance in m", low=-20, high=20),
-        group=_BEYOND,
         metavar="M",
     )
-    torsion: tuple[float, float] | None = opt(
+    torsion: tuple[float, float] | None = _beyond(
         "ratio of the deck's first torsional to its first bending frequency, and its radius of "
         "gyration in m; needs a lane offset (2:2.3 is typical; default: the site's, or no twist)",
         numbers("a frequency ratio and a radius of gyration in m (RATIO:M)", (0.2, 100), (0.1, 30)),
-        group=_BEYOND,
         metavar="RATIO:M",
     )
     output: Path = recording_option(required=True)

@@ -11,6 +11,7 @@ from services.common.endpoints import OnTheBus
 from services.common.errors import InputError
 from services.common.naming import count_of
 from services.common.options import (
+    count_option,
     endpoint_option,
     flag,
     history_option,
@@ -82,9 +83,7 @@ class AlarmOptions(OnTheBus):
         "with check and list: end with exit code 4 while an alarm is active, else with 3 if a file "
         "or a bridge could not be checked"
     )
-    processes: int = opt(
-        "number of processes (default: 1)", whole("a number", 1, 256), default=1, metavar="N"
-    )
+    processes: int = count_option("number of processes", "a number", 1, 1, 256)
     every: float = opt(
         "with serve: minutes between two checks (default: 60)",
         number("minutes", low=0.01, high=1e5),

@@ -9,7 +9,7 @@ from typing import Final
 from services.cli.parser import Subcommand
 from services.cli.parsing import a_console
 from services.common.kinds import PNG, SURVEY_JSON, SVG
-from services.common.options import number, opt, output_option, site_option, whole
+from services.common.options import count_option, number, opt, output_option, site_option
 
 
 def _speeds(text: str) -> tuple[float, float]:
@@ -38,12 +38,7 @@ class SurveyPlanOptions:
         default=0.2,
         metavar="SHARE",
     )
-    crossings: int = opt(
-        "number of crossings (default: 12)",
-        whole("a number of crossings", 1, 300),
-        default=12,
-        metavar="N",
-    )
+    crossings: int = count_option("number of crossings", "a number of crossings", 12, 1, 300)
     speed: tuple[float, float] | None = opt(
         "speed in m/s, or range SLOWEST:FASTEST of feasible speeds to compare; the plan itself "
         "then uses the site's survey_speed_m_per_s or 10 m/s (default: 5:20)",

@@ -16,6 +16,7 @@ from services.common.kinds import AIMS_JSON, RECORDS, VALIDATION_JSON, VALIDATIO
 from services.common.options import (
     CERTIFICATES,
     SCENARIOS,
+    count_option,
     names,
     noise_option,
     opt,
@@ -27,7 +28,6 @@ from services.common.options import (
     site_option,
     validations_folder,
     validations_option,
-    whole,
 )
 from services.simulation.effects import EFFECTS
 from services.simulation.survey_kinds import KINDS
@@ -93,18 +93,10 @@ class ValidateOptions:
         "JSON file of the results", "OUT.json", VALIDATION_JSON, AIMS_JSON
     )
     figures: Path | None = output_folder_option("folder for figures")
-    particles: int = opt(
-        "number of particles of the paper's random-walk search (default: 500)",
-        whole("particles", 1),
-        default=500,
-        metavar="N",
+    particles: int = count_option(
+        "number of particles of the paper's random-walk search", "particles", 500, 1
     )
-    steps: int = opt(
-        "number of steps of the paper's random-walk search (default: 600)",
-        whole("steps", 1),
-        default=600,
-        metavar="N",
-    )
+    steps: int = count_option("number of steps of the paper's random-walk search", "steps", 600, 1)
     seed: int = seed_option()
     method: str | None = opt(
         "paper: the paper's search and least squares, with no sensor error but --noise; pre: "
@@ -121,23 +113,16 @@ class ValidateOptions:
     validations: Path | None = validations_option(
         f"folder for validation records (default: {CERTIFICATES})", group=_OF_SITE
     )
-    crossings: int = opt(
-        "number of crossings whose truth is drawn from the priors (default: 200)",
-        whole("a number of crossings", 0),
-        default=200,
-        metavar="N",
+    crossings: int = count_option(
+        "number of crossings whose truth is drawn from the priors", "a number of crossings", 200
     )
-    control: int = opt(
-        "number of crossings repeated with only half of their noise declared (default: 20)",
-        whole("a number of crossings", 0),
-        default=20,
-        metavar="N",
+    control: int = count_option(
+        "number of crossings repeated with only half of their noise declared",
+        "a number of crossings",
+        20,
     )
-    out_of_model: int = opt(
-        "number of crossings for each out-of-model effect (default: 0)",
-        whole("a number of crossings", 0),
-        default=0,
-        metavar="N",
+    out_of_model: int = count_option(
+        "number of crossings for each out-of-model effect", "a number of crossings", 0
     )
     effects: tuple[str, ...] = opt(
         f"out-of-model effects, see docs/validation.md: {', '.join(EFFECTS)} (default: all)",
@@ -152,12 +137,11 @@ class ValidateOptions:
         RECORDS,
         default=Path("build/worlds.jsonl"),
     )
-    surveys: int = opt(
+    surveys: int = count_option(
         "number of fused surveys, of 8 to 16 crossings, for each of --kinds; with it nothing "
-        "else is run (default: 0)",
-        whole("a number of surveys", 0),
-        default=0,
-        metavar="N",
+        "else is run",
+        "a number of surveys",
+        0,
     )
     kinds: tuple[str, ...] = opt(
         f"kinds of survey, see studies/surveys.md: {', '.join(_KINDS)} (default: all)",
@@ -172,9 +156,7 @@ class ValidateOptions:
         default=Path("../shared/crossings"),
         metavar="DIR",
     )
-    processes: int = opt(
-        "number of processes (default: 2)", whole("processes", 1, 256), default=2, metavar="N"
-    )
+    processes: int = count_option("number of processes", "processes", 2, 1, 256)
     page: Path | None = output_option("Markdown page of the results", "PAGE.md", VALIDATION_PAGE)
 
 
