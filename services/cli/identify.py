@@ -104,11 +104,11 @@ def identify_command(
         line = f"{count_of(len(written), 'picture')} in {asked.figures}"
         console.print(line, soft_wrap=True)
     if asked.draws is not None:
-        drawn = [crossing for crossing in found.crossings if crossing.crossing_id in draws]
+        some = [crossing for crossing in found.crossings if crossing.crossing_id in draws]
         kept = (
-            DrawsOfCrossing(c.crossing_id, c.vehicle, c.bridge, draws[c.crossing_id]) for c in drawn
+            DrawsOfCrossing(c.crossing_id, c.vehicle, c.bridge, draws[c.crossing_id]) for c in some
         )
-        write_draws(asked.draws, kept, groups_beside(asked.draws, drawn))
+        write_draws(asked.draws, kept, groups_beside(asked.draws, some))
     return 0
 
 
