@@ -117,6 +117,8 @@ def _meant(value: object, key: str, kind: str) -> str:
         for unit, factor in (("cm", 1e-2), ("mm", 1e-3)):
             if low <= value * factor <= high:
                 return f"; in {unit}? then it is {value * factor:g}"
+    if kind == "less_than_equal" and key == "damping_ratio" and value <= 20.0:
+        return f"; in %? then it is {value / 100.0:g}"
     if kind == "less_than_equal" and key.endswith("_latitude_deg") and value <= 180.0:
         return "; a longitude?"
     if kind == "greater_than_equal" and key == "rate_hz" and 0.01 <= value < 1.0:

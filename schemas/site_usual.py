@@ -45,6 +45,10 @@ _ELEMENT_M: Final = 4.5
 _TYRE_WIDTH_M: Final = (0.1, 0.6)
 _TWIN_M: Final = (0.2, 0.6)
 _TRACK_M: Final = (1.0, 2.6)
+_TOTAL_T: Final = (1.0, 100.0)
+"""Total mass of a truck in t."""
+_AXLE_T: Final = (0.05, 5.0)
+"""Mass of an axle with its wheels in t."""
 _SURVEY_M_PER_S: Final = (3.0, 30.0)
 _RIGIDITY: Final = (("kN·m²", 1e3), ("MN·m²", 1e6), ("GN·m²", 1e9))
 
@@ -81,12 +85,15 @@ def of_truck(vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     arms = (vehicle.front_axle_to_cg_m, vehicle.cg_to_rear_axle_m)
     loads = (arms[1] / base, arms[0] / base)
     springs, tyres = vehicle.suspension_stiffness_n_per_m, vehicle.tyre_stiffness_n_per_m
-    axles = vehicle.unsprung_mass_kg
+    axles, total = vehicle.unsprung_mass_kg, vehicle.total_mass_kg
     for k, where in enumerate(("front", "rear")):
         body = vehicle.sprung_mass_kg * loads[k]
         key = f"suspension_stiffness_n_per_m[{k}]"
         value = _hz(springs[k], body)
-        slips: tuple[Slip, ...] = (Slip(key, springs[k], _power(value, 0.5), _STIFFNESS),)
+        slips: tuple[Slip, ...] = (
+            *_in_tonnes("total_mass_kg", total, _TOTAL_T, value),
+            Slip(key, springs[k], _power(value, 0.5), _STIFFNESS),
+        )
         text = f"{vehicle.id}: body bounces at {value:.3g} Hz on its {where} springs"
         yield _implied(f"bounce_{where}", text, value, _BOUNCE_HZ, "Hz", slips)
         damping = vehicle.suspension_damping_ns_per_m[k]
@@ -94,6 +101,7 @@ def of_truck(vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
         text = f"{vehicle.id}: damping ratio {value:.3g} of the body on its {where} springs"
         critical = 2.0 * math.sqrt(springs[k] * body)
         slips = (
+            *_in_tonnes("total_mass_kg", total, _TOTAL_T, value),
             Slip(
                 f"suspension_damping_ns_per_m[{k}]",
                 damping,
@@ -107,6 +115,7 @@ def of_truck(vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
         value = _hz(springs[k] + tyre, axle)
         text = f"{vehicle.id}: {where} axle hops at {value:.3g} Hz on its tyres"
         slips = (
+            *_in_tonnes(f"unsprung_mass_kg[{k}]", axle, _AXLE_T, value),
             Slip(
                 f"tyre_stiffness_n_per_m[{k}]",
                 tyre,
@@ -118,7 +127,9 @@ def of_truck(vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     inertia = vehicle.pitch_inertia_ratio * vehicle.sprung_mass_kg * arms[0] * arms[1]
     value = _hz(springs[0] * arms[0] ** 2 + springs[1] * arms[1] ** 2, inertia)
     text = f"{vehicle.id}: body pitches at {value:.3g} Hz"
-    yield _implied("pitch", text, value, _PITCH_HZ, "Hz", ())
+    yield _implied(
+        "pitch", text, value, _PITCH_HZ, "Hz", _in_tonnes("total_mass_kg", total, _TOTAL_T, value)
+    )
     yield from _odd(_loads(vehicle))
     yield from _odd(_pairs(vehicle, loads))
     yield from _odd(_tyres(vehicle))
@@ -195,6 +206,14 @@ def _odd(found: Iterator[ImpliedQuantity]) -> Iterator[ImpliedQuantity]:
             yield one._replace(is_certain=False)
 
 
+def _in_tonnes(
+    key: str, mass: float, usual_t: tuple[float, float], value: float
+) -> tuple[Slip, ...]:
+    """Return t as a unit of a mass that may be in t; `value` is proportional to its power -1/2."""
+    is_likely = usual_t[0] <= mass <= usual_t[1]
+    return (Slip(key, mass, _power(value, -0.5), (("t", 1e3),)),) if is_likely else ()
+
+
 def _as_ratio(damping: float, critical: float) -> tuple[tuple[str, float], ...]:
     """Return a damping ratio as a unit of a damper, where the value may be one."""
     return (("parts of critical damping", critical),) if 0.0 < damping <= 1.5 else ()
@@ -262,7 +281,11 @@ def _damping(bridge: Bridge, first_hz: float) -> ImpliedQuantity:
     value = 0.5 * (alpha / omega + beta * omega)
     low, high = _DAMPING
     meant = ""
-    if value > high and low <= alpha / (2.0 * omega) + beta <= high:
+    if bridge.first_frequency_hz is not None:  # the coefficients are not in the site file
+        ratio = alpha / rayleigh_of(1.0, bridge.first_frequency_hz)[0]
+        if value > high:
+            meant = f"damping_ratio is {ratio:.3g}: in %? then it is {ratio / 100.0:.3g}"
+    elif value > high and low <= alpha / (2.0 * omega) + beta <= high:
         meant = (
             f"rayleigh_beta_s is {beta:g}: a damping ratio? then it is {2.0 * beta / omega:.3g} s"
         )

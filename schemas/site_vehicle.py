@@ -291,8 +291,10 @@ def _check_axle(vehicle: Vehicle, k: int, body_kg: float) -> None:
 
 
 def _in_tonnes(mass_kg: float) -> str:
-    """Return a hint that a mass of a truck may be in t; empty where it may not."""
-    return f"; in t? then it is {1e3 * mass_kg:g}" if 1.0 <= mass_kg <= 100.0 else ""
+    """Return a hint that the total mass of a truck may be in t; empty where it may not."""
+    if not 1.0 <= mass_kg <= 100.0:
+        return ""
+    return f"; total_mass_kg is {mass_kg:g}: in t? then it is {1e3 * mass_kg:g}"
 
 
 def _stiffness(mass_kg: float, frequency_hz: float) -> float:

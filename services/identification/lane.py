@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from schemas.site import Bridge
 from services.common.geodesy import bridge_frame, to_chainage
 from services.finding.crossing_data import CrossingData
 
@@ -30,7 +31,18 @@ def lane_factor(data: CrossingData) -> float:
         bridge_frame(bridge), fixes.latitude_deg[on_bridge], fixes.longitude_deg[on_bridge]
     )
     measured_m = abs(float(np.median(lateral_m)))
-    aside_m = measured_m - abs(bridge.lane_offset_m)
-    if abs(aside_m) > _FARTHEST_ASIDE * np.hypot(bridge.lane_offset_m_spread, spread_m):
+    if not agrees_with_lane(bridge, measured_m, spread_m):
         return 1.0
     return float((measured_m / bridge.reference_lane_offset_m) ** 2)
+
+
+def agrees_with_lane(bridge: Bridge, lateral_m: float, spread_m: float) -> bool:
+    """Return whether a measured distance from the axis agrees with the declared lane, if any.
+
+    Its side does not matter: torsion is symmetric, and the opposite lane is on the other side.
+    `spread_m` is the receiver's slow error.
+    """
+    if bridge.lane_offset_m is None:
+        return True
+    aside_m = abs(abs(lateral_m) - abs(bridge.lane_offset_m))
+    return bool(aside_m <= _FARTHEST_ASIDE * np.hypot(bridge.lane_offset_m_spread, spread_m))

@@ -11,6 +11,7 @@ from services.common.geodesy import bridge_frame, to_chainage
 from services.finding.crossing_data import AFTER_M, APPROACH_M, LONGEST_MARGIN_S
 from services.finding.stays import CORRIDOR_M, Passage, Stay, stays_on
 from services.identification.identify import SLOWEST_M_PER_S
+from services.identification.lane import agrees_with_lane
 from services.inspection.finding import CheckFinding, CheckStatus, check_finding
 from services.inspection.recorded import InspectedRun
 
@@ -150,6 +151,14 @@ def _findings_of_track(
         "correct the coordinates of the bearings, or declare the receiver's position_spread_m",
         is_wrong=abs(track.lateral_m) > limit,
     )
+    if not agrees_with_lane(bridge, track.lateral_m, receiver.position_spread_m):
+        yield CheckFinding(
+            "lane_driven",
+            CheckStatus.OPEN,
+            f"{where}: wheel path {abs(track.lateral_m):.1f} m from the line between the bearings, "
+            f"lane_offset_m is {bridge.lane_offset_m:g}",
+            "correct lane_offset_m, or take the bearings' coordinates on the deck's axis",
+        )
     yield check_finding(
         "bridge_angle",
         f"{where}: wheel path at {abs(track.angle_deg):.1f}° to the line between the bearings",

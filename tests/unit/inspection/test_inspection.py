@@ -203,6 +203,19 @@ def test_bridges_that_lie_beside_the_road(tmp_path: Path) -> None:
     assert findings(tmp_path, run, far)["bridge_crossed"][0].state is CheckStatus.OPEN
 
 
+def test_lane_that_contradicts_the_wheel_path_is_open(tmp_path: Path) -> None:
+    case = sound()
+    for lane_m, is_named in ((1.75, False), (-1.75, False), (7.5, True), (-7.5, True)):
+        bridge = case.site.bridges[0].model_copy(update={"lane_offset_m": lane_m})
+        site = case.site.model_copy(update={"bridges": (bridge,)})
+        found = findings(tmp_path, case.run, site)
+        assert ("lane_driven" in found) is is_named, (lane_m, found)
+    (finding,) = found["lane_driven"]
+    assert finding.state is CheckStatus.OPEN
+    assert "lane_offset_m is -7.5" in finding.text
+    assert "lane_offset_m" in finding.advice
+
+
 def test_a_recording_that_begins_too_late(tmp_path: Path) -> None:
     case = sound()
     run = case.run

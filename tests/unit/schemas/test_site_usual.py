@@ -130,7 +130,7 @@ def test_springs_for_tyres_are_named() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"total_mass_kg": "17.7"}, "in t? then it is 17700"),
+        ({"total_mass_kg": "17.7"}, "total_mass_kg is 17.7: in t? then it is 17700"),
         ({"rayleigh_beta_s": "2.0"}, "a damping ratio in %? then it is 0.00"),
         ({"rayleigh_alpha_per_s": "0.0005", "rayleigh_beta_s": "0.7"}, "swapped with the other"),
         ({"suspension_damping_ns_per_m": "[0.2, 0.2]"}, "in parts of critical damping? then it is"),
@@ -285,3 +285,39 @@ def test_single_element_is_named_with_a_usual_number() -> None:
     text = with_value("bridge", "elements", "1")
     (line,) = warnings_of(parse_site(text, "site.toml"))
     assert "elements is 1: 7 are typical here" in line
+
+
+def test_masses_in_tonnes_are_named_and_no_spring_is_blamed() -> None:
+    text = TEXT
+    for key, values in (
+        ("total_mass_kg", SITE.vehicles[0].total_mass_kg),
+        ("unsprung_mass_kg", list(SITE.vehicles[0].unsprung_mass_kg)),
+    ):
+        less = [v / 1e3 for v in values] if isinstance(values, list) else values / 1e3
+        begin = text.index(f"\n{key} = ") + 1
+        text = f"{text[:begin]}{key} = {less}{text[text.index(chr(10), begin) :]}"
+    lines = warnings_of(parse_site(text, "site.toml"))
+    assert any(f"in t? then it is {SITE.vehicles[0].total_mass_kg:g}" in line for line in lines)
+    assert any("unsprung_mass_kg[0] is" in line and "in t?" in line for line in lines), lines
+    assert not [line for line in lines if "stiffness_n_per_m[" in line], lines
+
+
+@pytest.mark.parametrize(
+    ("ratio", "words"),
+    [
+        (
+            "2",
+            "damping_ratio is 2, it must be a damping ratio of at most 0.5; in %? then it is 0.02",
+        ),
+        ("0.5", "damping_ratio is 0.5: in %? then it is 0.005"),
+        ("0.0003", "check units and values"),
+    ],
+)
+def test_damping_ratio_in_per_cent_is_named_by_its_own_key(ratio: str, words: str) -> None:
+    text = by_frequency(3.29, 1.56e10).replace("damping_ratio = 0.02", f"damping_ratio = {ratio}")
+    try:
+        (line,) = warnings_of(parse_site(text, "site.toml"))
+    except InputError as error:
+        line = str(error)
+    assert words in line
+    assert "rayleigh" not in line
