@@ -174,7 +174,7 @@ def check_assignment(
     """Check order and signs of the middle readings (4, n) by the equations of the body."""
     reasons = signal_checks.order_and_signs(vehicle, acceleration, step_s, motion, 1)
     found = quality.assign_channels(acceleration, step_s, *signal_checks.body_constants(vehicle))
-    explained = 1.0 - found.recorded
+    explained = max(0.0, 1.0 - found.recorded)
     if Reason.CHANNEL_INVERTED in reasons and found.recorded <= signal_checks.MAX_UNEXPLAINED:
         # Axles that move against each other at one distance move alike at another.
         follows = scan_wheelbase(vehicle, acceleration, step_s, motion.position_m)
@@ -186,7 +186,7 @@ def check_assignment(
             "channel_swapped",
             CheckStatus.WRONG,
             _swapped(found, names),
-            "swap the two plugs, or correct the names",
+            "swap the two plugs, or correct the names, masses or springs",
         )
     if Reason.CHANNEL_INVERTED in reasons:
         return CheckFinding(
@@ -254,7 +254,7 @@ def _swapped(found: quality.ChannelAssignment, names: tuple[str, ...]) -> str:
         for k in range(4)
         if found.best_order[k] != k
     ]
-    share = f"{100.0 * found.recorded:.0f} % of the body's motion is unexplained"
+    share = f"{100.0 * min(1.0, found.recorded):.0f} % of the body's motion is unexplained"
     return f"{share}, and {', '.join(pairs)}"
 
 

@@ -1,5 +1,6 @@
 """What is wrong with a truck's recording is named, and a sound one is left alone."""
 
+import re
 from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
@@ -69,6 +70,21 @@ def test_what_is_recognised_before_a_fit_is_recognised_here(name: str, tmp_path:
     # One cause, one line: what follows from it is not said beside it.
     wrong = [key for key, those in found.items() if those[0].state is CheckStatus.WRONG]
     assert wrong == [str(reason)]
+
+
+def test_masses_of_another_unit_explain_no_more_than_nothing(tmp_path: Path) -> None:
+    """Masses in t leave a thousand times the body's motion unexplained; shares end at 100 %."""
+    case = sound()
+    (vehicle,) = case.site.vehicles
+    unsprung = tuple(mass / 1e3 for mass in vehicle.unsprung_mass_kg)
+    wrong = vehicle.model_copy(
+        update={"unsprung_mass_kg": unsprung, "total_mass_kg": vehicle.total_mass_kg / 1e3}
+    )
+    found = findings(tmp_path, case.run, case.site.model_copy(update={"vehicles": (wrong,)}))
+    (finding,) = [one for name in found if name.startswith("channel") for one in found[name]]
+    assert finding.state is CheckStatus.WRONG
+    assert re.search(r"\b(0|100) % of the body's motion", finding.text)
+    assert "masses" in finding.advice
 
 
 def test_swapped_channels_are_named(tmp_path: Path) -> None:
