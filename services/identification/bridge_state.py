@@ -148,11 +148,7 @@ def state_of(
         weakest_element=weakest,
         probability_of_loss=losses,
         level=_level(found, 0.0, 1.0),
-        thirds=ThirdsState(
-            left=_level(found, 0.0, 1 / 3),
-            middle=_level(found, 1 / 3, 2 / 3),
-            right=_level(found, 2 / 3, 1.0),
-        ),
+        thirds=_thirds(found),
         tracks=found.tracks,
         crossings_used=found.used,
         crossings_left_out=_named(left_out),
@@ -183,6 +179,14 @@ def _reasons(
     if any(one.verdict != "good" and one.crossing_id in found.used for one in crossings):
         reasons.append(BridgeReason.USES_SUSPECT)
     return tuple(reasons)
+
+
+def _thirds(found: FusedBridge) -> ThirdsState:
+    return ThirdsState(
+        left=_level(found, 0.0, 1 / 3),
+        middle=_level(found, 1 / 3, 2 / 3),
+        right=_level(found, 2 / 3, 1.0),
+    )
 
 
 class States:

@@ -12,7 +12,7 @@ import numpy as np
 from schemas.site import Site, Vehicle
 from services.common.errors import InputError
 from services.drives.runs import Run
-from services.simulation.drawn import CrossingTruth
+from services.simulation.drawn import ChannelErrors, CrossingTruth
 from services.simulation.drive_tandem import TandemDrive, tandem_case, truck_with_tandem
 from services.simulation.wheel_paths import WANDER_M, SurfaceOptions
 from services.simulation.wide_crossings import (
@@ -20,6 +20,7 @@ from services.simulation.wide_crossings import (
     WideCase,
     WideDrivenRun,
     WideRun,
+    WideSensor,
     drive_case,
 )
 
@@ -93,17 +94,7 @@ def drawn_tandem(
             rayleigh_alpha_per_s=beam.rayleigh_alpha_per_s,
             rayleigh_beta_s=beam.rayleigh_beta_s,
         ),
-        sensors=tuple(
-            one._replace(
-                noise_ug_per_rthz=declared.noise_density_ug_per_rthz,
-                gain_error=float(
-                    (1.0 + truth.channels.common_gain) * (1.0 + truth.channels.gain[c]) - 1.0
-                ),
-                delay_s=float(truth.channels.delay_s[c]),
-                bias_m_per_s2=float(truth.channels.bias_m_per_s2[c]),
-            )
-            for c, (one, declared) in enumerate(zip(case.sensors, vehicle.sensors, strict=True))
-        ),
+        sensors=_with_errors(case.sensors, vehicle, truth.channels),
         runs=(
             WideRun(
                 how.speed_m_per_s,
@@ -121,6 +112,21 @@ def drawn_tandem(
     declared = vehicle.model_copy(update={"sensors": rated})
     declared_site = site.model_copy(update={"vehicles": (declared,)})
     return DrawnTandem(case, declared_site, drive_case(case, 0))
+
+
+def _with_errors(
+    sensors: tuple[WideSensor, ...], vehicle: Vehicle, errors: ChannelErrors
+) -> tuple[WideSensor, ...]:
+    """Return the four sensors with the declared noise and the drawn errors."""
+    return tuple(
+        one._replace(
+            noise_ug_per_rthz=declared.noise_density_ug_per_rthz,
+            gain_error=float((1.0 + errors.common_gain) * (1.0 + errors.gain[c]) - 1.0),
+            delay_s=float(errors.delay_s[c]),
+            bias_m_per_s2=float(errors.bias_m_per_s2[c]),
+        )
+        for c, (one, declared) in enumerate(zip(sensors, vehicle.sensors, strict=True))
+    )
 
 
 def drawn_vehicle(vehicle: Vehicle, seed: int) -> Vehicle:
