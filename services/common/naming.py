@@ -1,6 +1,7 @@
 """Names that users and files give, as identifiers of keys; of crossings; and counted nouns."""
 
 import re
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Final
 
@@ -40,6 +41,11 @@ def checked_identifier(text: str, option: str) -> str:
 def count_of(number: float, noun: str, plural: str = "") -> str:
     """Return a whole number with its noun in the right number: `1 truck`, `0 trucks`."""
     return f"{number:.0f} {noun if number == 1 else plural or f'{noun}s'}"
+
+
+def first_of(names: Sequence[str], most: int) -> str:
+    """Return the first names in a line, with `…` where there are more than `most`."""
+    return ", ".join(names[:most]) + (" …" if len(names) > most else "")
 
 
 def processes_in_words(number: int) -> str:

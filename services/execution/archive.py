@@ -25,6 +25,7 @@ from schemas.site import Site
 from schemas.topics import Message
 from schemas.validation_records import VehicleBridgePair
 from services.common.errors import InputError
+from services.common.naming import first_of
 from services.common.stores import opened, size_of
 from services.execution.blas import one_blas_thread
 from services.execution.dispatch import CrossingExecutor
@@ -231,7 +232,7 @@ def _tasks_of_files(
     files: list[LocalRecording], job: ArchiveJob, problems: list[str]
 ) -> Iterator[IdentificationTask]:
     names = [file.name for file in files]
-    name = ", ".join(names[:_NAMES]) + (" …" if len(names) > _NAMES else "")
+    name = first_of(names, _NAMES)
     reading = _DriveReader(files, problems)
     try:
         drives = index_messages(name, cached_reader(reading.messages), job.site)

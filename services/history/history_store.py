@@ -26,6 +26,7 @@ from schemas.results import CrossingResult, ElementState, ResultHeader, Results
 from schemas.topics import check_identifier, check_realm
 from services.common.errors import InputError
 from services.common.files import make_folder, write_atomically
+from services.common.naming import first_of
 from services.common.parquet_files import FILES, arrow, decoded, encoded
 from services.history.add_summary import AddSummary, CrossingKey
 
@@ -160,8 +161,8 @@ def realm_of(folder: Path, bridge: str, realm: str | None) -> str:
     if everywhere:
         raise InputError(f"{folder}: {bridge} is in {', '.join(everywhere)}, not in {realm}")
     known = sorted({b for _, b in bridges_of(folder)})
-    some = ", ".join(known[:8]) + (" …" if len(known) > 8 else "")
-    raise InputError(f"{folder}: has no bridge {bridge}; there are {some or 'none'}")
+    some = first_of(known, 8) or "none"
+    raise InputError(f"{folder}: has no bridge {bridge}; there are {some}")
 
 
 def read_partition(where: Path, columns: Iterable[str] = ()) -> BridgeRows:

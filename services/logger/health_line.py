@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 
 from schemas.signals import NS_PER_S
-from services.common.naming import count_of, offset_in_words
+from services.common.naming import count_of, first_of, offset_in_words
 from services.logger.clocks import STEP_NS
 
 _MAX_NAMED = 3
@@ -49,7 +49,5 @@ def clock_note(figures: Mapping[str, float]) -> str:
 
 
 def _named(what: str, trucks_s: Mapping[str, float]) -> str:
-    few = list(trucks_s.items())[:_MAX_NAMED]
-    shown = [f"{truck} by {offset_in_words(by_s, 1)}" for truck, by_s in few]
-    more = " …" if len(trucks_s) > _MAX_NAMED else ""
-    return f"{what}: {', '.join(shown)}{more}" if shown else ""
+    shown = [f"{truck} by {offset_in_words(by_s, 1)}" for truck, by_s in trucks_s.items()]
+    return f"{what}: {first_of(shown, _MAX_NAMED)}" if shown else ""

@@ -10,6 +10,7 @@ import zenoh
 from services.bus.credentials import CONFIGURATION
 from services.bus.participants import UnlistedParticipants
 from services.bus.session import listed_participants
+from services.common.naming import first_of
 
 _log = logging.getLogger(__name__)
 _PERIOD_S: Final = 60.0
@@ -50,10 +51,7 @@ class UnlistedLog:
     def note(self) -> str:
         """Names of unlisted certificates that are connected, for `health`; empty without any."""
         names = [] if self._watch is None else self._watch.connected
-        if not names:
-            return ""
-        more = " …" if len(names) > _MAX_NOTED else ""
-        return f"connected and not listed: {', '.join(names[:_MAX_NOTED])}{more}"
+        return f"connected and not listed: {first_of(names, _MAX_NOTED)}" if names else ""
 
     def close(self) -> None:
         """Stop watching."""

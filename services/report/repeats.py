@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 
 from schemas.results import CrossingResult, Results
 from services.common.language import Language
+from services.common.naming import first_of
 
 _MAX_NAMED: Final = 3
 
@@ -51,7 +52,7 @@ def repeated(repeats: Sequence[Repeat], language: Language) -> Iterator[str]:
     """Yield a sentence for each pair of realms that hold the same crossings."""
     for realm, other in dict.fromkeys((one.realm, one.other) for one in repeats):
         names = [one.crossing_id for one in repeats if (one.realm, one.other) == (realm, other)]
-        listed = ", ".join(names[:_MAX_NAMED]) + (" …" if len(names) > _MAX_NAMED else "")
+        listed = first_of(names, _MAX_NAMED)
         yield language.choice(
             "quality.repeated", len(names), realm=realm, other=other, crossings=listed
         )

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import CrossingResult, verdict_line
 from services.common.log_lines import about
-from services.common.naming import count_of
+from services.common.naming import count_of, first_of
 from services.execution.dispatch import CrossingExecutor
 from services.identification.engine import Engine
 from services.worker.backfill import Backfill, WaitingCounts
@@ -96,9 +96,8 @@ def publish_health(
     notes += [f"refused {count_of(behind.refused, 'invalid message')}"] if behind.refused else []
     notes += [note] if note else []
     if load.unknown_vehicles:
-        more = " …" if len(load.unknown_vehicles) > _MAX_NAMED else ""
-        named = ", ".join(load.unknown_vehicles[:_MAX_NAMED])
-        notes.append(f"not in the site file, so without results: {named}{more}")
+        named = first_of(load.unknown_vehicles, _MAX_NAMED)
+        notes.append(f"not in the site file, so without results: {named}")
     figures = {
         "queue": float(behind.messages),
         "lag_s": behind.lag_s,
