@@ -42,7 +42,7 @@ _SMALLEST_CHI2 = 0.6
 """Smallest chi2 per degree of freedom without noise far below the declared, which makes intervals
 too wide."""
 LARGEST_PRIOR_Z = 4.0
-"""Largest plausible distance of a truck's parameter from its prior, in standard deviations."""
+"""Largest plausible distance of a parameter from its prior, in standard deviations."""
 _MAX_NAMED = 3
 _LARGEST_POSITION_Z = 4.0
 """Largest plausible slow error of the receiver, in standard deviations."""

@@ -161,19 +161,15 @@ def contradictions(
 ) -> dict[str, float]:
     """Return, as diagnostics, the bridge parameters other than EI that contradict the site file.
 
-    `draws` (steps, chains, f) are search coordinates. A parameter is listed with the deviation of
-    its mean, in logarithms where the prior is log-normal, beyond 4 standard deviations of it.
+    `draws` (steps, chains, f) are search coordinates, which are deviations from the priors in their
+    standard deviations. A parameter is listed if its mean deviates by more than 4 of them.
     """
-    priors = problem.priors
-    theta = posterior.values_of(problem, draws.reshape(-1, draws.shape[2])).theta
-    found = {}
-    for i in range(parameters.FIRST_OF_BRIDGE, parameters.EI_1):
-        if not priors.estimated[i]:
-            continue
-        values = theta[:, i] if priors.half_normal[i] else np.log(theta[:, i] / priors.theta[i])
-        z = float(values.mean() / priors.spread[i])
-        if abs(z) > LARGEST_PRIOR_Z:
-            found[f"{PRIOR_Z}{parameters.SCALARS[i].name}"] = z
+    estimated = np.flatnonzero(problem.priors.estimated)
+    found = {
+        f"{PRIOR_Z}{parameters.SCALARS[i].name}": float(z)
+        for i, z in zip(estimated, draws.mean(axis=(0, 1))[: estimated.size], strict=True)
+        if parameters.FIRST_OF_BRIDGE <= i < parameters.EI_1 and abs(z) > LARGEST_PRIOR_Z
+    }
     f1_hz, declared_hz = derived.f1_hz.mean, bridge.first_frequency_hz
     if declared_hz is not None and is_contradicted_frequency(f1_hz, declared_hz):
         found[FREQUENCY_RATIO] = f1_hz / declared_hz

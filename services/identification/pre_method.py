@@ -314,12 +314,12 @@ def _values(
     for k, name in enumerate(("m_s", "m_s1", "m_s2")):
         values[name] = summary_of("kg", masses[:, k] * scale, None)
     offset_m = flat[:, posterior.layout(problem).offset]
-    of_wheelbase, of_offset = _placement_priors(problem)
-    values["wheelbase_m"] = summary_of("m", at.wheelbase_m, of_wheelbase)
-    values["position_offset_m"] = summary_of("m", offset_m, of_offset)
+    placement = {"wheelbase_m": at.wheelbase_m, "position_offset_m": offset_m}
+    for name, prior in _placement_priors(problem).items():
+        values[name] = summary_of(parameters.unit(name), placement[name], prior)
     covariance = np.cov(theta[:, kept].T)
     draws = {names[i]: theta[:, i] for i in kept}
-    draws |= {"wheelbase_m": at.wheelbase_m, "position_offset_m": offset_m}
+    draws |= placement
     steps, chains = chain.draws.shape[:2]
     keep(
         data.crossing_id,
@@ -351,17 +351,16 @@ def _prior(problem: posterior.PosteriorProblem, i: int) -> results.Prior:
     )
 
 
-def _placement_priors(problem: posterior.PosteriorProblem) -> tuple[results.Prior, results.Prior]:
+def _placement_priors(problem: posterior.PosteriorProblem) -> dict[str, results.Prior]:
     """Return the priors of the wheelbase and of the receiver's slow error along the chainage."""
     priors = problem.priors
-    return (
-        results.Prior(
+    receiver_m = float(1.0 / problem.receiver_rows[-1, -1])
+    return {
+        "wheelbase_m": results.Prior(
             distribution="log_normal", location=priors.wheelbase_m, scale=priors.wheelbase_spread
         ),
-        results.Prior(
-            distribution="normal", location=0.0, scale=float(1.0 / problem.receiver_rows[-1, -1])
-        ),
-    )
+        "position_offset_m": results.Prior(distribution="normal", location=0.0, scale=receiver_m),
+    }
 
 
 def _chosen(count: int, wanted: int, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -45,9 +45,7 @@ def test_misfit_names_a_first_frequency_far_from_the_declared_one(
     assert seen.startswith(expected) if is_named else seen == ""
 
 
-def test_bridge_parameter_beyond_four_priors_deviations_is_a_diagnostic(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_bridge_parameter_beyond_four_priors_deviations_is_a_diagnostic() -> None:
     """Log-normal priors count in logarithms, half-normal ones from zero; EI has no remark."""
     nominal = np.ones(parameters.EI_1 + 1)
     spread = np.full(nominal.size, 0.1)
@@ -61,16 +59,15 @@ def test_bridge_parameter_beyond_four_priors_deviations_is_a_diagnostic(
     theta[:, parameters.F] = 0.41
     theta[:, parameters.F + 1] = 0.39
     theta[:, parameters.TORSION] = theta[:, parameters.EI_1] = 9.0
-    monkeypatch.setattr(posterior, "values_of", lambda *_: SimpleNamespace(theta=theta))
-    priors = SimpleNamespace(
-        theta=nominal, spread=spread, half_normal=half_normal, estimated=estimated
-    )
-    problem: Any = SimpleNamespace(priors=priors)
+    coordinates = np.where(half_normal, theta, np.log(theta / nominal)) / spread
+    further = np.full((2, 3), 50.0)  # those of the channels follow the parameters'
+    draws = np.hstack([coordinates[:, estimated], further])[None]
+    problem: Any = SimpleNamespace(priors=SimpleNamespace(estimated=estimated))
 
     def found(f1_hz: float, declared_hz: float | None) -> dict[str, float]:
         bridge: Any = SimpleNamespace(first_frequency_hz=declared_hz)
         derived: Any = SimpleNamespace(f1_hz=SimpleNamespace(mean=f1_hz))
-        return contradictions(bridge, problem, np.zeros((1, 2, 1)), derived)
+        return contradictions(bridge, problem, draws, derived)
 
     alone = found(5.1, None)
     assert alone == pytest.approx({"prior_z_rhoA": -22.0, "prior_z_f_start": 4.1})
