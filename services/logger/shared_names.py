@@ -68,10 +68,11 @@ class SharedNames:
             if now_ns - at_ns <= _REMEMBERED_S * NS_PER_S
         ]
         more = [f"{len(shared) - _MAX_NAMED} more"] if len(shared) > _MAX_NAMED else []
-        return "; ".join([*map(_fault, shared[:_MAX_NAMED]), *more])
+        return "; ".join([*map(shared_name, shared[:_MAX_NAMED]), *more])
 
 
-def _fault(sender: Key) -> str:
+def shared_name(sender: Key) -> str:
+    """Return that several trucks or workers have the name of a key."""
     if sender.owner == "vehicle":
         return f"several trucks in realm {sender.realm} are named {sender.identifier}"
     return f"several workers in realm {sender.realm} publish results of {sender.identifier}"
@@ -79,5 +80,5 @@ def _fault(sender: Key) -> str:
 
 def _line(sender: Key) -> str:
     if sender.owner == "vehicle":
-        return f"{_fault(sender)}: their crossings are mixed; give each truck an id of its own"
-    return f"{_fault(sender)}: crossings are identified repeatedly; stop all but one"
+        return f"{shared_name(sender)}: their crossings are mixed; give each truck an id of its own"
+    return f"{shared_name(sender)}: crossings are identified repeatedly; stop all but one"

@@ -38,6 +38,7 @@ from services.bus.subscription import RawSample, SeenSequences
 from services.common.intervals import Intervals
 from services.common.log_lines import about
 from services.logger.rate_limited_log import RateLimitedLog
+from services.logger.shared_names import shared_name
 from services.logger.spool_listing import SHARERS, SpoolListed, SpoolListing
 
 __all__ = ["Shortfall", "SpoolRecovery", "shortfall"]
@@ -112,7 +113,7 @@ class _Task:
     deadline_s: float
     got: Intervals = field(default_factory=Intervals)
     next_sequence: int | None = None
-    """Where the page continues."""
+    """First sequence after the page; None at the end of the range."""
     is_ended: bool = False
     """Whether a closing page has come."""
     replies: int = 0
@@ -408,10 +409,10 @@ def _note_shared(truck: _Truck, where: Key) -> None:
         return
     truck.is_shared = True
     _log.warning(
-        "several trucks in realm %s are named %s; all their spools are read, but give each truck "
-        "an id of its own",
-        where.realm, where.identifier, extra=about(realm=where.realm, vehicle=where.identifier),
-    )  # fmt: skip
+        "%s; all their spools are read, but give each truck an id of its own",
+        shared_name(where),
+        extra=about(realm=where.realm, vehicle=where.identifier),
+    )
 
 
 def _is_complete(task: _Task, next_sequence: int | None) -> bool:
