@@ -15,6 +15,7 @@ from schemas.site_damping import rayleigh_of
 from schemas.site_frequency import first_frequency_hz, given_frequencies
 from schemas.site_implied import MAX_BRIDGES, ImpliedQuantity
 from schemas.site_physics import G_M_PER_S2
+from schemas.site_vehicle import TOTAL_T
 
 _FIRST_HZ: Final = (0.25, 4.0)
 """First natural frequency relative to 100 Hz/L, L in m: a rule of thumb for road bridges."""
@@ -45,8 +46,6 @@ _ELEMENT_M: Final = 4.5
 _TYRE_WIDTH_M: Final = (0.1, 0.6)
 _TWIN_M: Final = (0.2, 0.6)
 _TRACK_M: Final = (1.0, 2.6)
-_TOTAL_T: Final = (1.0, 100.0)
-"""Total mass of a truck in t."""
 _AXLE_T: Final = (0.05, 5.0)
 """Mass of an axle with its wheels in t."""
 _SURVEY_M_PER_S: Final = (3.0, 30.0)
@@ -91,7 +90,7 @@ def of_truck(vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
         key = f"suspension_stiffness_n_per_m[{k}]"
         value = _hz(springs[k], body)
         slips: tuple[Slip, ...] = (
-            *_in_tonnes("total_mass_kg", total, _TOTAL_T, value),
+            *_in_tonnes("total_mass_kg", total, TOTAL_T, value),
             Slip(key, springs[k], _power(value, 0.5), _STIFFNESS),
         )
         text = f"{vehicle.id}: body bounces at {value:.3g} Hz on its {where} springs"
@@ -101,7 +100,7 @@ def of_truck(vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
         text = f"{vehicle.id}: damping ratio {value:.3g} of the body on its {where} springs"
         critical = 2.0 * math.sqrt(springs[k] * body)
         slips = (
-            *_in_tonnes("total_mass_kg", total, _TOTAL_T, value),
+            *_in_tonnes("total_mass_kg", total, TOTAL_T, value),
             Slip(
                 f"suspension_damping_ns_per_m[{k}]",
                 damping,
@@ -128,7 +127,7 @@ def of_truck(vehicle: Vehicle) -> Iterator[ImpliedQuantity]:
     value = _hz(springs[0] * arms[0] ** 2 + springs[1] * arms[1] ** 2, inertia)
     text = f"{vehicle.id}: body pitches at {value:.3g} Hz"
     yield _implied(
-        "pitch", text, value, _PITCH_HZ, "Hz", _in_tonnes("total_mass_kg", total, _TOTAL_T, value)
+        "pitch", text, value, _PITCH_HZ, "Hz", _in_tonnes("total_mass_kg", total, TOTAL_T, value)
     )
     yield from _odd(_loads(vehicle))
     yield from _odd(_pairs(vehicle, loads))

@@ -24,6 +24,8 @@ from schemas.site_sensors import MAX_SENSORS, PlacedSensor, check_places, check_
 from schemas.site_tandem import Tandem, tandem_of
 
 _TYRE_DAMPING_NS_PER_M: Final = 1000.0
+TOTAL_T: Final = (1.0, 100.0)
+"""Usual total mass of a truck in t."""
 _SMALLEST_MASS_KG: Final = 0.1
 _SMALLEST_AXLE: Final = 1e-3
 """Smallest share of the truck's mass in one axle, and in the body."""
@@ -292,7 +294,7 @@ def _check_axle(vehicle: Vehicle, k: int, body_kg: float) -> None:
 
 def _in_tonnes(mass_kg: float) -> str:
     """Return a hint that the total mass of a truck may be in t; empty where it may not."""
-    if not 1.0 <= mass_kg <= 100.0:
+    if not TOTAL_T[0] <= mass_kg <= TOTAL_T[1]:
         return ""
     return f"; total_mass_kg is {mass_kg:g}: in t? then it is {1e3 * mass_kg:g}"
 
