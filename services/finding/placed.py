@@ -245,7 +245,8 @@ def disagreement(
     def judged(parity: Floats, signals: Floats) -> RedundancyResidual:
         return redundancy_residual(parity, signals, step_s, *spreads, _SLACK)
 
-    for parity in tuple(parity / MICRO_G_M_PER_S2 for parity in reduction_of(vehicle).parities):
+    # The parities are for accelerations in units of the noise, 1 µg/√Hz for sensors without any.
+    for parity in (one / MICRO_G_M_PER_S2 for one in reduction_of(vehicle).parities):
         found = judged(parity, acceleration)
         if found.power <= found.expected:
             continue

@@ -9,6 +9,7 @@ import numpy as np
 from schemas.signals import decode_gnss
 from schemas.site import Bridge
 from schemas.topics import Key
+from services.common.arrays import Floats
 
 _NEAR_M: Final = 1000.0
 """Distance at which a bridge is one that the trucks use."""
@@ -66,7 +67,7 @@ class SiteFit:
         )
 
 
-def _distances_m(places: np.ndarray, latitude_deg: float, longitude_deg: float) -> np.ndarray:
+def _distances_m(places: Floats, latitude_deg: float, longitude_deg: float) -> Floats:
     """Return the distances (n,) in m on a sphere from places (n, 2), latitude and longitude."""
     latitude, longitude = math.radians(latitude_deg), math.radians(longitude_deg)
     half = np.sin((places - (latitude, longitude)) / 2) ** 2

@@ -80,8 +80,8 @@ class AlarmOptions(OnTheBus):
     )
     all: bool = flag("check all bridges, not only those with new crossings or periods")
     exit_code: bool = flag(
-        "with check and list: end with exit code 4 while an alarm is active, else with 3 if a file "
-        "or a bridge could not be checked"
+        f"with check and list: end with exit code {_EXIT_ALARM} while an alarm is active, else "
+        f"with {_EXIT_UNCHECKED} if a file or a bridge could not be checked"
     )
     processes: int = count_option("number of processes", "a number", 1, 1, 256)
     every: float = opt(
