@@ -85,22 +85,22 @@ def conditional_draws(
 
     The noise is `inflation` times the declared one. See `residual_draws` for when they end.
     """
-    of = _partition(found, inflation)
+    partition = _partition(found, inflation)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 26,)))
-    n = of.kept.size
+    n = partition.kept.size
     count = round(_POINTS_PER_TERM * (n + 1) * (n + 2) / 2)
-    first = compliances.present_points(found, count, _WIDER * inflation, seed)[:, of.kept]
-    at_optimum = _points(of, of.y[None, of.kept]).integrated[0].log_determinant
+    first = compliances.present_points(found, count, _WIDER * inflation, seed)[:, partition.kept]
+    at_optimum = _points(partition, partition.y[None, partition.kept]).integrated[0].log_determinant
     density = DrawnDensity(
-        partial(_residuals, of, at_optimum),
-        partial(prior_squares, prior_centres(found, of.kept[:-1])),
-        np.searchsorted(of.kept[:-1], posterior.layout(of.problem).half_normal),
-        posterior.log_odds_of_absence(of.problem, inflation)[of.kept],
+        partial(_residuals, partition, at_optimum),
+        partial(prior_squares, prior_centres(found, partition.kept[:-1])),
+        np.searchsorted(partition.kept[:-1], posterior.layout(partition.problem).half_normal),
+        posterior.log_odds_of_absence(partition.problem, inflation)[partition.kept],
         inflation,
-        partial(_completed, of, at_optimum, rng),
+        partial(_completed, partition, at_optimum, rng),
     )
     weighted = residual_draws(density, first, draws, rng, report, _ROUNDS)
-    each = 1 + of.swing.size
+    each = 1 + partition.swing.size
     evaluations = each * (1 + first.shape[0]) + (1 + each) * weighted.y.shape[0]
     return ConditionalDraws(weighted, evaluations)
 
@@ -144,13 +144,13 @@ def _partition(found: Optimum, inflation: float) -> _Partition:
     )
 
 
-def _integrated(of: _Partition, residual: FloatArray, waves: FloatArray) -> _Integrated:
+def _integrated(partition: _Partition, residual: FloatArray, waves: FloatArray) -> _Integrated:
     """Integrate the linear coordinates out of the residuals (m,) of one point.
 
     `waves` (m, w) are the effects of the vibration there.
     """
     unexplained = np.column_stack([residual, waves])
-    unexplained -= of.basis @ (of.basis.T @ unexplained)
+    unexplained -= partition.basis @ (partition.basis.T @ unexplained)
     basis, root = np.linalg.qr(unexplained[:, 1:])
     along = basis.T @ unexplained[:, 0]
     return _Integrated(
@@ -170,48 +170,50 @@ class _IntegratedPoints(NamedTuple):
     integrated: dict[int, _Integrated]
 
 
-def _points(of: _Partition, drawn: FloatArray) -> _IntegratedPoints:
+def _points(partition: _Partition, drawn: FloatArray) -> _IntegratedPoints:
     """Return the points at kept coordinates (k, n + 1)."""
-    y, moves = moved(of.problem, of.y, of.kept, drawn)
-    y[:, of.linear] += moves @ of.follow.T
-    residuals, effects = swing_effects(of.problem, y, of.rows)
+    y, moves = moved(partition.problem, partition.y, partition.kept, drawn)
+    y[:, partition.linear] += moves @ partition.follow.T
+    residuals, effects = swing_effects(partition.problem, y, partition.rows)
     waves = np.moveaxis(effects, 0, 2)
     are_finite = np.isfinite(residuals).all(axis=1) & np.isfinite(waves).all(axis=(1, 2))
     integrated = {
-        int(k): _integrated(of, residuals[k], waves[k]) for k in np.flatnonzero(are_finite)
+        int(k): _integrated(partition, residuals[k], waves[k]) for k in np.flatnonzero(are_finite)
     }
     return _IntegratedPoints(y, residuals, waves, integrated)
 
 
-def _with_determinant(of: _Partition, at_optimum: float, points: _IntegratedPoints) -> FloatArray:
+def _with_determinant(
+    partition: _Partition, at_optimum: float, points: _IntegratedPoints
+) -> FloatArray:
     """Return residuals (m + 1, k) whose squares include the determinant."""
-    out = np.full((of.rows.size + 1, points.y.shape[0]), np.nan)
+    out = np.full((partition.rows.size + 1, points.y.shape[0]), np.nan)
     for k, one in points.integrated.items():
-        excess = of.inflation**2 * (one.log_determinant - at_optimum)
+        excess = partition.inflation**2 * (one.log_determinant - at_optimum)
         out[:, k] = np.append(one.residual, np.sqrt(max(_LEVEL**2 + excess, 0.0)))
     return out
 
 
-def _residuals(of: _Partition, at_optimum: float, drawn: FloatArray) -> FloatArray:
+def _residuals(partition: _Partition, at_optimum: float, drawn: FloatArray) -> FloatArray:
     """Return residuals (m + 1, k) at points (k, n + 1), all other coordinates integrated out."""
-    return _with_determinant(of, at_optimum, _points(of, drawn))
+    return _with_determinant(partition, at_optimum, _points(partition, drawn))
 
 
 def _completed(
-    of: _Partition, at_optimum: float, rng: np.random.Generator, drawn: FloatArray
+    partition: _Partition, at_optimum: float, rng: np.random.Generator, drawn: FloatArray
 ) -> CompletedDraws:
     """Return draws (k, n + 1) with all linear coordinates drawn given these."""
-    points = _points(of, drawn)
+    points = _points(partition, drawn)
     y, squares = points.y, np.full(drawn.shape[0], np.nan)
-    normal = rng.standard_normal((drawn.shape[0], of.swing.size + of.linear.size))
+    normal = rng.standard_normal((drawn.shape[0], partition.swing.size + partition.linear.size))
     for k, one in points.integrated.items():
-        of_swing, of_linear = np.split(normal[k], [of.swing.size])
-        swing = one.swing + of.inflation * solve_triangular(one.root, of_swing)
-        left = of.effects.T @ (points.residuals[k] + points.waves[k] @ swing)
-        linear = of.inflation * solve_triangular(of.root, of_linear)
-        y[k, of.swing] = swing
-        y[k, of.linear] += linear - cho_solve((of.root, False), left)
+        of_swing, of_linear = np.split(normal[k], [partition.swing.size])
+        swing = one.swing + partition.inflation * solve_triangular(one.root, of_swing)
+        left = partition.effects.T @ (points.residuals[k] + points.waves[k] @ swing)
+        linear = partition.inflation * solve_triangular(partition.root, of_linear)
+        y[k, partition.swing] = swing
+        y[k, partition.linear] += linear - cho_solve((partition.root, False), left)
         # The density of the completion: its determinant, and the squares of its normal.
-        squares[k] = of.inflation**2 * (one.log_determinant - normal[k] @ normal[k])
-    squares += np.sum(posterior.all_rows(of.problem, y)[:, of.rows] ** 2, axis=1)
-    return CompletedDraws(_with_determinant(of, at_optimum, points), y, squares)
+        squares[k] = partition.inflation**2 * (one.log_determinant - normal[k] @ normal[k])
+    squares += np.sum(posterior.all_rows(partition.problem, y)[:, partition.rows] ** 2, axis=1)
+    return CompletedDraws(_with_determinant(partition, at_optimum, points), y, squares)

@@ -92,15 +92,15 @@ def mismatch_weights(
 
 
 def correlation(
-    of: MismatchWeights, truck: NoisePath, gain: FloatArray, delay_s: FloatArray
+    weights: MismatchWeights, truck: NoisePath, gain: FloatArray, delay_s: FloatArray
 ) -> float:
     """Return E[r' C_0^-1 r_k] per residual sample, for mismatch alone.
 
     Here r are the residuals of the first truck and r_k those of `truck`; `gain` (4,) and `delay_s`
     (4,) are those of its channels.
     """
-    equations = _equations(of, truck) * channel_factors(of.omega, gain, delay_s)
-    return float(np.vdot(of.weight.conj(), equations).real)
+    equations = _equations(weights, truck) * channel_factors(weights.omega, gain, delay_s)
+    return float(np.vdot(weights.weight.conj(), equations).real)
 
 
 def channel_factors(
@@ -110,12 +110,12 @@ def channel_factors(
     return np.asarray((1.0 + gain)[:, None] * np.exp(1j * np.outer(delay_s, omega)))
 
 
-def _equations(of: MismatchWeights, truck: NoisePath) -> NDArray[np.complex128]:
+def _equations(weights: MismatchWeights, truck: NoisePath) -> NDArray[np.complex128]:
     """Return the equations (4, 4, f) of a truck, of profiles less each axle's own deflection."""
-    equations = estimation_matrix(truck, of.omega)
-    if of.receptance.any():
-        flexibility = truck.theta[TORSION] * of.torsion.load_factor
-        equations[:2] -= of.omega**2 * (flexibility * of.receptance) * _axle_masses(truck)
+    equations = estimation_matrix(truck, weights.omega)
+    if weights.receptance.any():
+        flexibility = truck.theta[TORSION] * weights.torsion.load_factor
+        equations[:2] -= weights.omega**2 * (flexibility * weights.receptance) * _axle_masses(truck)
     return equations
 
 
@@ -132,9 +132,9 @@ def mismatch_power(
     Here r are the residuals of the first truck and r_k those of another, each with its `channels`;
     the other arguments are as in `mismatch_weights`.
     """
-    of = mismatch_weights(rows, trucks[0], channels, density, force, stretch)
+    weights = mismatch_weights(rows, trucks[0], channels, density, force, stretch)
     found = [
-        correlation(of, truck, gain, delay_s)
+        correlation(weights, truck, gain, delay_s)
         for truck, gain, delay_s in zip(trucks, channels.gain, channels.delay_s, strict=True)
     ]
     return np.asarray(found[1:]) - found[0]

@@ -74,10 +74,12 @@ def expected_squares(problem: PosteriorProblem, y: FloatArray) -> ExpectedSquare
         weight += 0.5 * part.residuals / _FREQUENCIES * np.linalg.inv(whitened_for)
         if road is not None:
             stretch = ComparedStretch(road, float(values_of(problem, y[None, :]).wheelbase_m[0]))
-            of = mismatch_weights(problem.rows, truck, channels, problem.density, force, stretch)
-            more = part.residuals * of.weight
+            weights = mismatch_weights(
+                problem.rows, truck, channels, problem.density, force, stretch
+            )
+            more = part.residuals * weights.weight
             of_mismatch = of_mismatch + more if omega.size else more
-            omega = of.omega
+            omega = weights.omega
     about = ExpectedSquares(problem, bands, weight, omega, of_mismatch, y, 0.0, np.zeros(y.size))
     truck_size = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
     where = layout(problem)
@@ -102,16 +104,16 @@ def _trucks(problem: PosteriorProblem, y: FloatArray) -> tuple[list[NoisePath], 
     ], problem.priors.delay_spread_s * y[:, layout(problem).delays]
 
 
-def _half_squares(of: ExpectedSquares, y: FloatArray) -> FloatArray:
+def _half_squares(expected: ExpectedSquares, y: FloatArray) -> FloatArray:
     """Return half the expected squares (k,) at points y (k, f), up to a constant."""
-    problem = of.problem
+    problem = expected.problem
     force = REDUCED_WEIGHT_FACTOR * problem.force
     found = np.zeros(y.shape[0])
     for k, (truck, delay_s) in enumerate(zip(*_trucks(problem, y), strict=True)):
-        spectrum = folded_spectrum(of.bands, truck, problem.density, force, None)
-        found[k] = np.vdot(of.weight.conj(), np.swapaxes(spectrum, 1, 2)).real
-        if of.omega.size:
-            equations = estimation_matrix(truck, of.omega)
-            equations *= channel_factors(of.omega, np.zeros(CHANNELS), delay_s)
-            found[k] += np.vdot(of.mismatch_weight.conj(), equations).real
+        spectrum = folded_spectrum(expected.bands, truck, problem.density, force, None)
+        found[k] = np.vdot(expected.weight.conj(), np.swapaxes(spectrum, 1, 2)).real
+        if expected.omega.size:
+            equations = estimation_matrix(truck, expected.omega)
+            equations *= channel_factors(expected.omega, np.zeros(CHANNELS), delay_s)
+            found[k] += np.vdot(expected.mismatch_weight.conj(), equations).real
     return found

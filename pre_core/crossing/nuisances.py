@@ -149,33 +149,33 @@ def with_mixture(columns: FloatArray, size: int) -> FloatArray:
     return np.vstack([columns, np.zeros((size + 1, columns.shape[1]))])
 
 
-def unexplained(of: Nuisances, columns: FloatArray) -> FloatArray:
+def unexplained(nuisances: Nuisances, columns: FloatArray) -> FloatArray:
     """Return the part of columns (m + r + 1, n) that no nuisance explains."""
-    return np.asarray(columns - of.basis @ (of.basis.T @ columns))
+    return np.asarray(columns - nuisances.basis @ (nuisances.basis.T @ columns))
 
 
-def integrated_residuals(of: Nuisances, drawn: FloatArray, *, has_step: bool) -> FloatArray:
+def integrated_residuals(nuisances: Nuisances, drawn: FloatArray, *, has_step: bool) -> FloatArray:
     """Return residuals (m + r + 1, k) at points (k, n + 1), with nuisances integrated out.
 
     Each point takes an evaluation, and another one if it `has_step` of its own.
     """
-    points = followed(of, drawn, has_step=has_step)
-    residuals = unexplained(of, _residuals(of, points))
-    squares = _LEVEL**2 - 2.0 * of.expected.beyond_tangent(points)
+    points = followed(nuisances, drawn, has_step=has_step)
+    residuals = unexplained(nuisances, _residuals(nuisances, points))
+    squares = _LEVEL**2 - 2.0 * nuisances.expected.beyond_tangent(points)
     residuals[-1] = np.sqrt(np.maximum(squares, 0.0))
     return residuals
 
 
-def followed(of: Nuisances, drawn: FloatArray, *, has_step: bool) -> FloatArray:
+def followed(nuisances: Nuisances, drawn: FloatArray, *, has_step: bool) -> FloatArray:
     """Return points y (k, f) with the nuisances that follow points (k, n + 1).
 
     Each takes an evaluation if it `has_step` of its own.
     """
-    points, moves = moved(of.problem, of.y, of.kept, drawn)
-    points[:, of.own] += moves @ of.of_own.T
-    points[:, of.parts.linear] += moves @ of.of_linear.T
+    points, moves = moved(nuisances.problem, nuisances.y, nuisances.kept, drawn)
+    points[:, nuisances.own] += moves @ nuisances.of_own.T
+    points[:, nuisances.parts.linear] += moves @ nuisances.of_linear.T
     if has_step:
-        points[:, of.own] += (of.step @ _residuals(of, points)).T
+        points[:, nuisances.own] += (nuisances.step @ _residuals(nuisances, points)).T
     return points
 
 
@@ -193,9 +193,12 @@ def moved(
     return points, moves
 
 
-def _residuals(of: Nuisances, points: FloatArray) -> FloatArray:
+def _residuals(nuisances: Nuisances, points: FloatArray) -> FloatArray:
     """Return residuals (m + r + 1, k) at points y (k, f), without the expected squares."""
-    return with_mixture(posterior.all_rows(of.problem, points)[:, of.parts.rows].T, of.mixture_size)
+    return with_mixture(
+        posterior.all_rows(nuisances.problem, points)[:, nuisances.parts.rows].T,
+        nuisances.mixture_size,
+    )
 
 
 def _swing_waves(

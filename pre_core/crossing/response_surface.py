@@ -74,24 +74,24 @@ def _products(u: FloatArray) -> FloatArray:
 
 
 def response_surface(
-    of: Nuisances, jacobian: FloatArray, drawn: FloatArray, *, has_step: bool = False
+    nuisances: Nuisances, jacobian: FloatArray, drawn: FloatArray, *, has_step: bool = False
 ) -> ResponseSurface:
     """Return the surface of a crossing fitted at points of its curved coordinates and offset.
 
     `jacobian` (rows, f) is that of its residuals at the optimum, in the coordinates y. `drawn`
     (k, n + 1) are the points. With `has_step` the nuisances of each point take a Gauss-Newton step.
     """
-    parts, r = of.parts, of.mixture_size
-    linear = unexplained(of, with_mixture(jacobian[np.ix_(parts.rows, parts.linear)], r))
-    waves = unexplained(of, with_mixture(parts.waves, r))
+    parts, r = nuisances.parts, nuisances.mixture_size
+    linear = unexplained(nuisances, with_mixture(jacobian[np.ix_(parts.rows, parts.linear)], r))
+    waves = unexplained(nuisances, with_mixture(parts.waves, r))
     # A parameter that the site file excludes has the size zero.
     centre, size = drawn.mean(axis=0), np.maximum(drawn.std(axis=0), _LEAST_SIZE)
     fitted, error = _fit_parabolas(
         (drawn - centre) / size,
-        lambda some: integrated_residuals(of, drawn[some], has_step=has_step),
+        lambda some: integrated_residuals(nuisances, drawn[some], has_step=has_step),
     )
     few = _root_of_squares(np.hstack([fitted, linear, waves]), error)
-    n = of.kept.size
+    n = nuisances.kept.size
     ends = np.cumsum([1, n, fitted.shape[1] - 1 - n, linear.shape[1]])
     constant, slopes, products, linear, waves = np.hsplit(few, ends)
     return ResponseSurface(
@@ -101,10 +101,10 @@ def response_surface(
         slopes,
         products,
         linear,
-        of.y[parts.linear] + of.of_linear @ (centre - of.y[of.kept]),
-        of.of_linear * size,
+        nuisances.y[parts.linear] + nuisances.of_linear @ (centre - nuisances.y[nuisances.kept]),
+        nuisances.of_linear * size,
         waves,
-        of.evaluations + (2 if has_step else 1) * drawn.shape[0],
+        nuisances.evaluations + (2 if has_step else 1) * drawn.shape[0],
     )
 
 
@@ -137,17 +137,17 @@ def added(one: ParabolaSums, other: ParabolaSums) -> ParabolaSums:
     )
 
 
-def parabolas(of: ParabolaSums) -> tuple[FloatArray, FloatArray]:
+def parabolas(sums: ParabolaSums) -> tuple[FloatArray, FloatArray]:
     """Return constant, slopes and products (m, p) of the values, and their error.
 
     The error (p, p) is the covariance that the remainder causes, summed over the m values.
     """
-    normal = of.gram.copy()
+    normal = sums.gram.copy()
     normal[1:, 1:] += _RIDGE * np.eye(normal.shape[0] - 1)
     inverse = cho_solve(cho_factor(normal), np.eye(normal.shape[0]))
-    fitted = inverse @ of.image
-    degrees = max(1.0, of.points - float(np.sum(inverse * of.gram)))
-    remainder = (of.squares - float(np.sum(fitted * of.image))) / degrees
+    fitted = inverse @ sums.image
+    degrees = max(1.0, sums.points - float(np.sum(inverse * sums.gram)))
+    remainder = (sums.squares - float(np.sum(fitted * sums.image))) / degrees
     return np.asarray(fitted.T), remainder * inverse
 
 

@@ -84,10 +84,10 @@ class CurvedSum(NamedTuple):
         return np.asarray(-0.5 * squares)
 
 
-def _squares_and_pull(x: FloatArray, of: _CurvedCrossing) -> tuple[FloatArray, FloatArray]:
+def _squares_and_pull(x: FloatArray, crossing: _CurvedCrossing) -> tuple[FloatArray, FloatArray]:
     """Return a crossing's squares (k,) and linear parts (k, s) of shared variables, x (k, b)."""
-    features = of.form.features(x)
-    return np.sum((features @ of.squares) * features, axis=1), features @ of.linear
+    features = crossing.form.features(x)
+    return np.sum((features @ crossing.squares) * features, axis=1), features @ crossing.linear
 
 
 def curved_sum(
@@ -122,18 +122,24 @@ def _curved_crossing(
     priors: BridgePriors,
     variability: tuple[float, float],
 ) -> _CurvedCrossing:
-    of, layout, centre = part.likelihood, information.layout, information.centre
-    b, t, q = layout.bridge, len(of.truck.names), of.knots_m.size
+    likelihood, layout, centre = part.likelihood, information.layout, information.centre
+    b, t, q = layout.bridge, len(likelihood.truck.names), likelihood.knots_m.size
     key = path_group_key(part)
     track = tracks.get(key)
     whole = wave_precision(part, tracks)
-    near = linearised_likelihood(of, centre, whole)
+    near = linearised_likelihood(likelihood, centre, whole)
     m = near.target.size
-    others = of.root[:, b : b + t + q]
+    others = likelihood.root[:, b : b + t + q]
     of_priors = np.eye(t + q)
     of_priors[t:, t:] = whole
     free = np.eye(m) - others @ np.linalg.solve(others.T @ others + of_priors, others.T)
-    form = curved_form(of.root[:, :b], of.target, of.root[:, b + t + q :], of.bends, free)
+    form = curved_form(
+        likelihood.root[:, :b],
+        likelihood.target,
+        likelihood.root[:, b + t + q :],
+        likelihood.bends,
+        free,
+    )
     of_bridge, of_truck, of_waves = np.hsplit(near.root[:, : b + t + q], [b, b + t])
     changes = of_bridge[:, layout.elements] * centre[layout.elements]
     own = [changes @ change_root(priors.elements, *variability)]
@@ -162,7 +168,7 @@ def _curved_crossing(
 
 
 def curved_draws(
-    of: CurvedSum,
+    curved: CurvedSum,
     priors: BridgePriors,
     count: int,
     rng: np.random.Generator,
@@ -170,23 +176,23 @@ def curved_draws(
     threads: int = 1,
 ) -> FloatArray:
     """Return draws y (count, b) of the bridge's coordinates; they do not depend on `threads`."""
-    near = of.covariance / _WIDENED**2
+    near = curved.covariance / _WIDENED**2
     cut_off = np.flatnonzero(~priors.coordinates.is_log)
     each = -(-count // len(_MOVES))
     with ThreadPoolExecutor(threads) as pool:
 
         def log_posterior(latent: LatentCoordinates, v: FloatArray) -> FloatArray:
-            found = of.log_posterior(latent.values(v), pool) + latent.log_share(v)
+            found = curved.log_posterior(latent.values(v), pool) + latent.log_share(v)
             return np.where(np.isfinite(found), found, -np.inf)
 
         # The correlations with restraints and bearings at the most likely bridge do not hold far
         # from it, so that the first coordinates are independent.
-        alone = latent_coordinates(cut_off, priors.log_odds, of.mean, np.diag(np.diag(near)))
+        alone = latent_coordinates(cut_off, priors.log_odds, curved.mean, np.diag(np.diag(near)))
         target = partial(log_posterior, alone)
         first = tempering.tempered_draws(
             target,
-            of.mean,
-            of.covariance,
+            curved.mean,
+            curved.covariance,
             each,
             _FIRST_MOVES,
             rng,

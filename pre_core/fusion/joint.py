@@ -87,8 +87,8 @@ def sample_joint(
     if any(one.likelihood.bends and one.likelihood.bends.logarithms for one in parts):
         parts = sorted(parts, key=lambda part: part.name)
         usual = mean_variability(between)
-        of = curved_sum(parts, path_groups(parts), information, priors, usual)
-        drawn = _draw_curved(of, priors, between, count, seed, report, threads)
+        curved = curved_sum(parts, path_groups(parts), information, priors, usual)
+        drawn = _draw_curved(curved, priors, between, count, seed, report, threads)
     else:
         drawn = _draw_bridge(information, priors, between, count, seed, report, threads)
     return FusedDraws(*drawn, is_consistent_with_zero(between), information.shared)
@@ -118,10 +118,12 @@ def build_joint(
         )
         information = JointInformation(names, layout, crossings, prior, centre, shared)
         # Without variability, crossings with intervals narrower than it would bias the centre.
-        of = varying_bridge(information._replace(crossings=information.select(consistent)))
+        varying = varying_bridge(information._replace(crossings=information.select(consistent)))
         before, centre = (
             centre,
-            _most_likely(layout, priors, *marginalise_variability(information, of, *_USUAL)[:2]),
+            _most_likely(
+                layout, priors, *marginalise_variability(information, varying, *_USUAL)[:2]
+            ),
         )
         if np.all(np.abs(centre - before) < _SETTLED):
             break
@@ -191,11 +193,13 @@ def _linearised_about(
     part: FusionInput, tracks: dict[PathGroupKey, PathGroup], bridge: FloatArray | None
 ) -> FusionInput:
     """Return the crossing linearised about a `bridge` (b,); None: about its own estimate."""
-    of = part.likelihood
-    if of.bends is None:
+    likelihood = part.likelihood
+    if likelihood.bends is None:
         return part
-    at = of.bends.about if bridge is None else bridge
-    return part._replace(likelihood=linearised_likelihood(of, at, wave_precision(part, tracks)))
+    at = likelihood.bends.about if bridge is None else bridge
+    return part._replace(
+        likelihood=linearised_likelihood(likelihood, at, wave_precision(part, tracks))
+    )
 
 
 def _layout_of(
@@ -223,9 +227,9 @@ def _crossing_information(
     priors: BridgePriors,
     centre: FloatArray,
 ) -> CrossingInformation:
-    of, b = part.likelihood, layout.bridge
+    likelihood, b = part.likelihood, layout.bridge
     truck = layout.trucks[part.truck]
-    precision, linear = add_mass_parameter(of, part.mass_spread, priors, centre)
+    precision, linear = add_mass_parameter(likelihood, part.mass_spread, priors, centre)
     places = np.concatenate([np.arange(b), truck])
     key = path_group_key(part)
     if key in tracks:
@@ -233,7 +237,7 @@ def _crossing_information(
         if part.name in tracks[key].short_roots:
             root = tracks[key].short_roots[part.name]
             precision, linear = add_covariance(precision, linear, unit[:, :b], root)
-        q = of.knots_m.size
+        q = likelihood.knots_m.size
         precision, linear = add_covariance(precision, linear, unit[:, -q:], tracks[key].own_root)
         if key in layout.tracks:
             places = np.concatenate([places, layout.tracks[key]])
@@ -258,7 +262,7 @@ def add_mass_parameter(
 
 
 def _draw_curved(
-    of: CurvedSum,
+    curved: CurvedSum,
     priors: BridgePriors,
     between: VariabilityPosterior,
     count: int,
@@ -269,7 +273,7 @@ def _draw_curved(
     """Return draws as `_draw_bridge` does, on the crossings' response surfaces."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 22,)))
     progress = partial(report, "drawing the bridge")
-    drawn = curved_draws(of, priors, count * CHAINS, rng, progress, threads)
+    drawn = curved_draws(curved, priors, count * CHAINS, rng, progress, threads)
     order = rng.permutation(count * CHAINS)
     taus = draws_of_tau(between, count * CHAINS, rng)
     return drawn[order].reshape(count, CHAINS, -1), taus.reshape(count, CHAINS)
@@ -289,13 +293,13 @@ def _draw_bridge(
     # Systematic sampling: the number of draws of each follows its weight.
     at = (np.arange(count) + rng.random()) / count
     chosen = np.minimum(np.searchsorted(np.cumsum(between.weight), at), between.weight.size - 1)
-    of = varying_bridge(information)
+    varying = varying_bridge(information)
     steps, taus = [], []
     for k in np.unique(chosen):
         some = int((chosen == k).sum())
         tau, rho = float(between.tau[k]), float(between.rho[k])
         density = _posterior(
-            information, priors, *marginalise_variability(information, of, tau, rho)[:2]
+            information, priors, *marginalise_variability(information, varying, tau, rho)[:2]
         )
         steps.append(_Step(density, some, (int(k) + 1) * CHAINS))
         taus.append(draws_of_tau_within(between, int(k), (some, CHAINS), rng))
@@ -330,7 +334,7 @@ def _posterior(
     information: JointInformation, priors: BridgePriors, precision: FloatArray, linear: FloatArray
 ) -> CompliancePosterior:
     """Return a sum of crossings times the priors, marginal in the bridge's coordinates."""
-    layout, of = information.layout, priors.coordinates
+    layout, coordinates = information.layout, priors.coordinates
     precision, linear = marginal(precision, linear, np.arange(layout.bridge))
     single = np.arange(layout.bridge - priors.elements)
     precision[single, single] += 1.0
@@ -338,8 +342,8 @@ def _posterior(
         precision,
         linear,
         layout.elements,
-        np.flatnonzero(~of.is_log),
-        of.scale[layout.elements],
+        np.flatnonzero(~coordinates.is_log),
+        coordinates.scale[layout.elements],
         priors.log_odds,
         information.centre[layout.elements],
     )

@@ -153,9 +153,9 @@ def shared_fraction(
     pairs = 0.5 * float((count * (count - 1)).sum())
     if pairs == 0.0:
         return None
-    claimed, bandwidth = _claimed_power(mismatch)
-    share = 0.5 * float((value.sum(axis=0) ** 2 - squares).sum()) / pairs / claimed
-    noisy = float(squares.sum() / count.sum()) / claimed
+    implied, bandwidth = _implied_power(mismatch)
+    share = 0.5 * float((value.sum(axis=0) ** 2 - squares).sum()) / pairs / implied
+    noisy = float(squares.sum() / count.sum()) / implied
     # A band of B cycles/m over L metres has 2 B L independent values.
     places = int((count > 1).sum())
     independent = 2.0 * bandwidth * OFF_BRIDGE_STEP_M * places
@@ -186,21 +186,21 @@ def _shifted(values: FloatArray, steps: float) -> FloatArray:
     return out
 
 
-def _seen(cycles_per_m: FloatArray) -> FloatArray:
+def _power_gain(cycles_per_m: FloatArray) -> FloatArray:
     """Return the power gain (g,) of the second difference at spatial frequencies (g,)."""
     return np.asarray(16.0 * np.sin(np.pi * cycles_per_m * _APART_STEPS * OFF_BRIDGE_STEP_M) ** 4)
 
 
-def _claimed_power(mismatch: Mismatch) -> tuple[float, float]:
+def _implied_power(mismatch: Mismatch) -> tuple[float, float]:
     """Return the variance in m² of second differences that the levels imply, and their bandwidth.
 
     The bandwidth is in cycles/m.
     """
     grid = mismatch.shapes.cycles_per_m
-    seen = (mismatch.level_m3 @ mismatch.shapes.density) * _seen(grid)
+    passed = (mismatch.level_m3 @ mismatch.shapes.density) * _power_gain(grid)
     step = float(grid[1] - grid[0])
-    power = step * float(seen.sum())
-    return power, power**2 / (step * float(seen @ seen))
+    power = step * float(passed.sum())
+    return power, power**2 / (step * float(passed @ passed))
 
 
 def wander_posterior(mismatch: Mismatch, share: SharedFraction | None) -> WanderPosterior:
@@ -208,7 +208,7 @@ def wander_posterior(mismatch: Mismatch, share: SharedFraction | None) -> Wander
 
     Without a shared fraction it is the prior.
     """
-    weight = _seen(mismatch.shapes.cycles_per_m)
+    weight = _power_gain(mismatch.shapes.cycles_per_m)
     whole = float(mismatch.level_m3 @ mismatch.shapes.density @ weight)
     common = [
         float(mismatch.level_m3 @ spectra @ weight) / whole
