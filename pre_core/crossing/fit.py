@@ -41,8 +41,9 @@ weight of the body equations ends: right starts of 90 simulated crossings had 1.
 ones 10 to 70."""
 _POOR_START_CHI2, WORTH_COMPLETING_CHI2 = 1.7, 5.0
 """Values of chi2 at five times the noise: above the first a fit is left unfinished until the other
-offsets have been tried, above the second also until other strategies have been. Accepted fits had
-1.7 at most, and one of 50 had 3.7; fault-free crossings with mismatch had 2 to 20 without it."""
+offsets have been tried, above the second also until other strategies have been. Of 50 accepted fits
+one had 3.7, all others 1.7 at most; fits without mismatch of fault-free crossings that have it had
+2 to 20."""
 FAR_OFF_CHI2 = 200.0
 """Value of chi2 at five times the noise, with reduced weight of the body equations, above which a
 fit is not continued and, after a first fit, no other offset is tried: fault-free crossings had 13
@@ -193,7 +194,7 @@ def resting_mode_indices(problem: PosteriorProblem, strategy: SearchStrategy) ->
 
 
 def _not_negative(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
-    """Return y with restricted coordinates at zero at least."""
+    """Return y with negative values of restricted coordinates replaced by zero."""
     zero = layout(problem).half_normal
     y = y.copy()
     y[zero] = np.maximum(y[zero], 0.0)

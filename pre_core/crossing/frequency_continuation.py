@@ -96,7 +96,7 @@ class _Coordinates(NamedTuple):
 def other_bridges(
     found: Optimum, strategy: SearchStrategy, *, is_even: bool
 ) -> tuple[list[OtherBridge], int]:
-    """Return bridges that fit about as well as an optimum, best first, and count evaluations.
+    """Return bridges that fit about as well as an optimum, best first, and the evaluations used.
 
     They are fitted from elements of nominal rigidity on bearings that are free or restrained, rigid
     or compliant: both ends alike if `is_even`, else one end at a time. The noise is that of a deck

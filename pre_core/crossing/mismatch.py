@@ -106,7 +106,7 @@ class Mismatch(NamedTuple):
     level_m3: FloatArray  # (s,)
     speed_m_per_s: float
     pavement: BridgePavement | None = None
-    """Difference of the bridge's pavement; None where it is the road's."""
+    """Mismatch on the bridge relative to that off it; None where both are alike."""
 
 
 @lru_cache(maxsize=8)

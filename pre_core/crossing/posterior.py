@@ -271,7 +271,7 @@ def noise_path_at(problem: PosteriorProblem, y: FloatArray) -> tuple[NoisePath, 
 
 
 def suspension_equation_weight(problem: PosteriorProblem, y: FloatArray) -> float:
-    """Return the weight of the body equations, 0 to 1, at y (f,); 0 if equalised."""
+    """Return the weight of the body equations, 0 to 1, at y (f,); 0 for an equalised tandem."""
     if has_tandem(problem) and problem.crossing.lead.is_equalised:
         return 0.0
     return _noise.suspension_equation_weight(

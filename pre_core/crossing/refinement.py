@@ -50,7 +50,7 @@ to 22 at the first one tried; with a skew plate it was 4,500."""
 
 
 def refined(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> tuple[Optimum, int]:
-    """Return the best of an optimum and those that follow from it, and count evaluations."""
+    """Return the best of an optimum and those found from it, and the number of evaluations."""
     if _is_sharp(found):
         return _with_other_bridge(found, strategy, max_evaluations)
     return _refine_offset(found, strategy, max_evaluations)
@@ -59,7 +59,7 @@ def refined(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> t
 def about_truck(
     found: Optimum, y: FloatArray, strategy: SearchStrategy, max_evaluations: int
 ) -> tuple[Optimum | None, int]:
-    """Return the best optimum of bridges about a truck at y (f,), and count evaluations.
+    """Return the best optimum of bridges about a truck at y (f,), and the number of evaluations.
 
     The truck explains the residuals off the bridge, where no bridge acts, so a misfit of `found`
     may be due to a bridge that vibrates at another frequency. Bridges of other frequencies are
@@ -89,7 +89,7 @@ def about_truck(
 def _best_bridge(
     best: Optimum, strategy: SearchStrategy, max_evaluations: int
 ) -> tuple[Optimum, int]:
-    """Return the best of `best` and optima of other bridges about it, and count evaluations.
+    """Return the best of `best` and other bridges about it, and the number of evaluations.
 
     They are tried again about each better one: the bridge next to a wrong one may be the true one.
     """
@@ -127,7 +127,7 @@ def _chi2_at_full_weight(found: Optimum) -> float:
 def _fits_about(
     around: Optimum, strategy: SearchStrategy, tried: int, *, is_even: bool
 ) -> tuple[list[Optimum], int]:
-    """Return fits of all parameters from `tried` other bridges at most, and count evaluations.
+    """Return fits from `tried` other bridges at most, and the number of evaluations.
 
     They are completed up to `_COMPLETED_CHI2`; an accepted one is the last.
     """
@@ -183,7 +183,7 @@ def _is_sharp(found: Optimum) -> bool:
 def _with_other_bridge(
     found: Optimum, strategy: SearchStrategy, max_evaluations: int
 ) -> tuple[Optimum, int]:
-    """Return the best of an optimum and those of other bridges, and count evaluations."""
+    """Return the best of an optimum and those of other bridges, and the number of evaluations."""
     evaluations = 0
     rivals: list[OtherBridge] = []
     failed, is_even = 0, True
@@ -207,7 +207,7 @@ def _with_other_bridge(
 def _refine_offset(
     found: Optimum, strategy: SearchStrategy, max_evaluations: int
 ) -> tuple[Optimum, int]:
-    """Return the best of an optimum and, with mismatch, its neighbours; count evaluations."""
+    """Return the best of an optimum and, with mismatch, its neighbours, and evaluations used."""
     evaluations = 0
     for _ in range(_MAX_MOVES):
         if evaluations > max_evaluations or not found.problem.mismatch.level_m3.any():
@@ -229,9 +229,9 @@ def _refine_offset(
 def with_full_weight(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> Optimum:
     """Return the better optimum, at reduced weight of the body equations or about another bridge.
 
-    A wrong bridge moves the truck as its springs would not, and is accepted at reduced weight. Real
-    friction and nonlinear springs act off the bridge, too: where a linear truck explains the
-    residuals there, bridges about this truck are tried.
+    The body equations of a linear truck contradict a wrong bridge, which is therefore accepted only
+    at their reduced weight. Real friction and nonlinear springs act off the bridge, too: where a
+    linear truck explains the residuals there, bridges about this truck are tried.
     """
     if not found.problem.force.any() or not is_accepted(found.problem, found.chi2_per_dof):
         return found
@@ -245,7 +245,7 @@ def with_full_weight(found: Optimum, strategy: SearchStrategy, max_evaluations: 
 
 
 def with_free_ends(found: Optimum, strategy: SearchStrategy) -> tuple[Optimum, int]:
-    """Return the better optimum, with rotational restraints or without, and count evaluations.
+    """Return the better optimum, rotationally restrained or not, and the number of evaluations.
 
     A bridge restrained at both ends with less than half its stiffness deflects nearly as one on
     free bearings, with a truck that is wrong by a third of its prior's standard deviation: a search

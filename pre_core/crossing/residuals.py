@@ -101,7 +101,7 @@ def _wheels(
             load[i] = sign * transfer * speeding[i] - weight - inertial - m_u * a_u[i]
         # The tyre force accelerates the masses above it, whatever springs are between; where these
         # are linear, they give the same with far less noise of the body sensors.
-        force = work.sharp[w]  # not in use yet
+        force = work.sharp[w]  # written later, by `precompensate_force`
         if crossing.is_inertial:
             for i in range(n):
                 force[i] = -load[i] - weight
@@ -228,7 +228,7 @@ def _evaluate(
     what: int,
     out: FloatArray,
 ) -> None:
-    """Write the output `what` of the points from `part[0]` to `part[1]` to `out`; else NaN.
+    """Write the output `what` of points `part[0]` to `part[1]` to `out`, NaN for impossible ones.
 
     One kernel serves all three outputs: three kernels would each contain a copy of the model and
     take as long to load.

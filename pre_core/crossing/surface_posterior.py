@@ -132,7 +132,7 @@ def drawn_by_residuals(
 def _likely_rivals(
     found: Optimum, nuisances: Nuisances, density: DrawnDensity
 ) -> tuple[list[Optimum], int]:
-    """Return the rivals of an optimum that are not negligible, as optima, and count evaluations.
+    """Return the likely rivals of an optimum, as optima, and the number of evaluations.
 
     Their nuisances follow them, as in the posterior that is drawn.
     """

@@ -102,7 +102,7 @@ def _local_fit(problem: PosteriorProblem, y: FloatArray, strategy: SearchStrateg
 def scan_offsets(
     problem: PosteriorProblem, y: FloatArray, strategy: SearchStrategy
 ) -> tuple[list[Placement], int]:
-    """Return candidates along the road about y (f,), best first, and count evaluations.
+    """Return candidates along the road about y (f,), best first, and the number of evaluations.
 
     The fit improves towards the right offset from afar, so the scan ends soon after the best one.
     The axles of a tandem are too close together for that: other minima metres away fit well enough

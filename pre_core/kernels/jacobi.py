@@ -19,7 +19,10 @@ is far below rounding."""
 
 @inner
 def _rotation(a: FloatArray, p: int, q: int, cosine: FloatArray, sine: FloatArray) -> float:
-    """Compute cosine and sine (4,) that annul a_pq; return how far a_pq² exceeds the negligible."""
+    """Compute cosine and sine (4,) that annul a_pq; return a_pq² minus its largest negligible size.
+
+    Of the four lanes the largest difference is returned.
+    """
     excess = -1.0
     for lane in range(LANES):
         off = a[p, q, lane]

@@ -37,7 +37,7 @@ COEFFICIENTS = 5
 class LoadedStretch(NamedTuple):
     """Input and output of `advance`: samples during which each wheel stays in one part.
 
-    `deflection` is added to.
+    `advance` adds to `deflection`.
     """
 
     front: int

@@ -15,7 +15,7 @@ from scipy.special import logsumexp
 from pre_core.arrays import FloatArray
 
 LogDensity = Callable[[FloatArray], FloatArray]
-"""Logarithm of a density (k,) at points (k, d), up to a constant."""
+"""Function from points (k, d) to the logarithm (k,) of a density there, up to a constant."""
 
 _MAX_ROUNDS, _SAME_SCALE = 50, 1e-6
 """Largest number of rounds that scale the densities to each other, and the change of a log scale

@@ -75,7 +75,8 @@ class LMInfo(NamedTuple):
 
 
 Rows = Callable[[FloatArray], FloatArray]
-"""Residuals (k, m) at points (k, f); a value that is not finite marks an impossible point."""
+"""Function from points (k, f) to their residuals (k, m); a value that is not finite marks an
+impossible point."""
 
 
 def initial_state(rows: Rows, y: FloatArray, differences: DifferenceScheme = FORWARD) -> LMState:

@@ -3,8 +3,8 @@
 A population follows a path of densities from a wide normal to the target (Del Moral, Doucet and
 Jasra 2006). Each step to the next density leaves half of the draws effective (Jasra et al. 2011),
 resamples them, and moves each by differences of others (ter Braak 2006), which follow the scales
-and directions of the population by themselves. Some moves change few coordinates, of those in which
-the first normal is white.
+and directions of the population by themselves. Some moves change only a few coordinates. The first
+normal is white in these coordinates.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,8 +31,8 @@ _STEP_SPREAD = 0.4
 _WHOLE = 0.1
 """Share of moves by a whole difference, from peak to peak."""
 _FEW, _FEWER = 0.4, 2.0
-"""Share of the coordinates that one move of three changes, and mean number that another changes:
-the first follows curved peaks, the second switches values between zero and positive."""
+"""Share of the coordinates that the second of three moves changes, and mean number that the third
+changes: the second follows curved peaks, the third switches values between zero and positive."""
 
 
 class _Population(NamedTuple):

@@ -30,7 +30,7 @@ from pre_core.search import levenberg_marquardt
 from pre_core.search.loop import Termination
 
 DRAWS: Final = 2000
-"""Number of draws of a forecast, which give a standard deviation to 2 % of itself."""
+"""Number of draws of a forecast, from which a standard deviation has a relative error of 2 %."""
 _CHAINS = 2
 _SEED = 1
 
