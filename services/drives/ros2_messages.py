@@ -89,31 +89,31 @@ def check_rosbags() -> None:
     check_installed("ROS 2", "rosbags", extra="ros2")
 
 
-def decode(of: RosType, payload: bytes) -> Imu | Fix | Velocity:
+def decode(ros_type: RosType, payload: bytes) -> Imu | Fix | Velocity:
     """Return the content of a message; ValueError if it is of another type or impossible."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise ValueError(f"has {len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are expected")
     try:
-        message: Any = _types().deserialize_cdr(payload, of.name)
+        message: Any = _types().deserialize_cdr(payload, ros_type.name)
     except Exception as error:  # bytes of unknown origin may break the decoder in any way
-        raise ValueError(f"is no {of.name}: {error}") from None
+        raise ValueError(f"is no {ros_type.name}: {error}") from None
     stamp_ns = _stamp_ns(message.header.stamp)
-    if of == IMU:
+    if ros_type == IMU:
         return _imu(stamp_ns, message)
-    if of == FIX:
+    if ros_type == FIX:
         return _fix(stamp_ns, message)
-    twist = message.twist if of == TWIST else message.twist.twist
+    twist = message.twist if ros_type == TWIST else message.twist.twist
     speed = math.hypot(twist.linear.x, twist.linear.y)
     if not math.isfinite(speed):
         raise ValueError("has a velocity that is not finite")
     return Velocity(stamp_ns, speed)
 
 
-def unknown_hash(of: RosType, declared: str) -> str | None:
+def unknown_hash(ros_type: RosType, declared: str) -> str | None:
     """Return what is wrong with a type's declared hash; None if nothing is."""
-    if declared in (of.hash, NO_HASH):
+    if declared in (ros_type.hash, NO_HASH):
         return None
-    return f"{of.name} has the type hash {declared[:80]}, known is {of.hash}"
+    return f"{ros_type.name} has the type hash {declared[:80]}, known is {ros_type.hash}"
 
 
 @cache

@@ -106,7 +106,7 @@ class Ros2Truck:
         return (FIX,) if topic == self.table.gnss else VELOCITIES
 
     def convert(
-        self, topic: str, of: RosType, payload: bytes, sent_ns: int, publisher: bytes = b""
+        self, topic: str, ros_type: RosType, payload: bytes, sent_ns: int, publisher: bytes = b""
     ) -> list[Accel | GnssFix]:
         """Convert a message; return what can be published now, without identities.
 
@@ -114,7 +114,7 @@ class Ros2Truck:
         `anomalies`.
         """
         try:
-            message = decode(of, payload)
+            message = decode(ros_type, payload)
         except ValueError as error:
             self.anomalies.add(topic, UNREADABLE, example=f"the first {error}")
             return []

@@ -334,15 +334,15 @@ def fusable_of(row: HistoryRow) -> "FusableCrossing | None":
     return FusableCrossing(row.entry_s, row.exit_s, row.crossing_id, verdict, elements, source)
 
 
-def packed_observation(of: "Observation") -> bytes:
+def packed_observation(observation: "Observation") -> bytes:
     """Return an observation as bytes: sizes and names, then numbers, the loadings in 32 bits."""
-    n = of.value.size
-    head = [_SIZES.pack(n, len(of.shared))]
-    for one in of.shared:
+    n = observation.value.size
+    head = [_SIZES.pack(n, len(observation.shared))]
+    for one in observation.shared:
         name = one.name.encode()
         head += [_SIZES.pack(one.loading.shape[1], len(name)), name]
-    numbers = np.concatenate([of.value, of.own[np.triu_indices(n)]]).astype("<f8")
-    loadings = [np.ascontiguousarray(one.loading, "<f4").tobytes() for one in of.shared]
+    numbers = np.concatenate([observation.value, observation.own[np.triu_indices(n)]]).astype("<f8")
+    loadings = [np.ascontiguousarray(one.loading, "<f4").tobytes() for one in observation.shared]
     return b"".join([*head, numbers.tobytes(), *loadings])
 
 

@@ -32,12 +32,13 @@ def observation_of(result: CrossingResult) -> Observation | None:
     return _named_shortly(found) if sound else None
 
 
-def _named_shortly(of: Observation) -> Observation:
+def _named_shortly(observation: Observation) -> Observation:
     """Return the observation with short names: a truck's key identifies it completely, in 1 kB."""
     shared = tuple(
-        one._replace(name=f"{one.name.split(' ', 1)[0]}-{_digest(one.name)}") for one in of.shared
+        one._replace(name=f"{one.name.split(' ', 1)[0]}-{_digest(one.name)}")
+        for one in observation.shared
     )
-    return of._replace(shared=shared)
+    return observation._replace(shared=shared)
 
 
 def _digest(text: str) -> str:
