@@ -1,4 +1,4 @@
-"""Cautions on a comparison with a baseline: its own crossings, another kind, a later time."""
+"""Cautions on a comparison with a baseline: shared, simulated, doubtful or later crossings."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Set
 
@@ -56,9 +56,10 @@ def baseline_cautions(
     now: RealmsOfBridges,
     then: RealmsOfBridges,
 ) -> Iterator[str]:
-    """Yield a line for each bridge that is compared with another kind, or with its own crossings.
+    """Yield a line for each baseline with shared crossings, and each of another kind.
 
-    `now` and `then` are the realms of the crossings and of those of the baselines.
+    The kinds are simulated and real. `now` and `then` are the realms of the crossings and of those
+    of the baselines.
     """
     for name, state in states.items():
         if name not in baselines:

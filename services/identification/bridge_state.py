@@ -45,12 +45,12 @@ from services.identification.usable import add_crossings as add_crossings
 from services.identification.usable import usable as usable
 
 _MANY = 2
-"""Crossings excluded as contradictory, from which on a state is doubtful: one alone is an error of
-that crossing, of several the bridge itself may have changed."""
+"""Smallest number of crossings excluded as contradictory that makes a state doubtful: a single one
+is itself wrong, but several may show that the bridge has changed."""
 _LARGEST_BETWEEN = 1.5 * BETWEEN_SCALE
 """Lower limit of the variability between crossings above which a state is doubtful. Two groups of
-crossings, of a sound bridge and of one with a loss, would pass as a bridge that varies so much, and
-their mean as its state."""
+crossings, before and after a loss, would pass as a bridge that varies so much, with their mean as
+its state."""
 _CONTRADICTIONS = frozenset(
     (BridgeReason.CROSSINGS_DISAGREE, BridgeReason.NEWEST_DISAGREE, BridgeReason.MANY_LEFT_OUT)
 )
@@ -68,8 +68,8 @@ class FusionSettings(NamedTuple):
 
 
 NOTHING_STORED = FusionSettings()
-_SOUND = 0.9
-"""Share of the baseline; see `Derived.probability_below_90_percent_of_baseline`."""
+_BASELINE_SHARE = 0.9
+"""Share of the baseline's EI in `Derived.probability_below_90_percent_of_baseline`."""
 
 
 def against(result: CrossingResult, baseline: BridgeResult | None) -> CrossingResult:
@@ -78,11 +78,11 @@ def against(result: CrossingResult, baseline: BridgeResult | None) -> CrossingRe
         return result
     stored = baseline.elements
     below = {
-        name: _probability_below(_SOUND, now, of)
-        for name, of in stored.items()
+        name: _probability_below(_BASELINE_SHARE, now, before)
+        for name, before in stored.items()
         if (now := result.parameters.get(name)) is not None
-        and now.mean > 0.0 < of.mean
-        and not unresolved_elements((now, of))
+        and now.mean > 0.0 < before.mean
+        and not unresolved_elements((now, before))
     }
     derived = result.derived.model_copy(
         update={"probability_below_90_percent_of_baseline": below or None}
@@ -91,7 +91,10 @@ def against(result: CrossingResult, baseline: BridgeResult | None) -> CrossingRe
 
 
 def _probability_below(share: float, now: Parameter, before: ElementState) -> float:
-    """Return the probability for two log-normals with independent errors."""
+    """Return the probability that EI is below a `share` of its earlier value, both log-normal.
+
+    Their errors are independent.
+    """
     spread = np.hypot(now.std / now.mean, before.std / before.mean)
     apart = np.log(share * before.mean / now.mean)
     return float(ndtr(apart / spread)) if spread > 0.0 else float(apart > 0.0)
@@ -271,7 +274,7 @@ def _of_resolved(
 ) -> tuple[str | None, dict[str, dict[str, float]] | None]:
     """Return the weakest element, and probabilities of loss if there is a baseline.
 
-    Only of elements that both the measurement and its baseline resolve.
+    Elements that the measurement or its baseline does not resolve are left out.
     """
     vague = unresolved_elements(elements.values())
     if baseline is not None:

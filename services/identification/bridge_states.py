@@ -82,7 +82,7 @@ class BridgeStates:
         for known in crossings:
             if known.usable is not None and not known.is_in_state:
                 name = (known.realm, known.bridge)
-                # No state names older ones.
+                # A state lists no older crossings.
                 listed = self._at(*name).counted.newest[-LISTED_AT_MOST:]
                 if any(one.crossing_id == known.crossing_id for one in listed):
                     owed[name] = known.usable.exit_time

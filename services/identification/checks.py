@@ -28,7 +28,7 @@ _FALSE_ALARM_Z = 4.5
 _SLACK = (1.35, 1.35, 1.35, 1.15)
 """Tolerated noise power of each band, relative to the declared one. The declared density comes from
 a data sheet, which omits the sensor's 1/f noise."""
-_SLACK_OF_TWO_ROADS = 1.6
+_SLACK_WITH_MISMATCH = 1.6
 """Tolerated power where the axles' profiles differ: three standard deviations of a mismatch level
 estimated from some ten waves."""
 SHORTEST_APPROACH_M = 12.0
@@ -84,7 +84,7 @@ _REAR_OVER_FRONT = 2.5
 semitrailers and tandems declared with two axles: 0.15 to 1.3, 1.9 to 190 times the front's.
 Two-axle trucks: at most 0.05, with dry friction 0.21. Between the first and the second threshold it
 is a cause to name where another check fails, and no reason by itself."""
-_LED_AWAY = 40.0
+_LARGEST_MISMATCH_BIAS = 40.0
 """Largest tolerated correction for the mismatch, in multiples of a prior's spread. Fault-free: at
 most 3; trailers and searches that diverged: 540 to 13,000."""
 _MISMATCH_EXCESS = 30.0
@@ -125,7 +125,7 @@ class Fit(NamedTuple):
     """Slow error of the receiver in multiples of its spread."""
     rigidity_spread: Floats
     """Standard deviation of ln EI (elements,), relative to the prior's."""
-    has_two_roads: bool
+    has_mismatch: bool
     """Whether the residuals off the bridge show that the axles' profiles differ."""
     off_bridge_m: float
     """Length of road off the bridge from which the mismatch was estimated."""
@@ -151,7 +151,7 @@ def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
     reasons = [Reason.TANDEM_FRICTION] if fit.tandem_friction > _TANDEM_FRICTION else []
     reasons += _of_the_rows(data, fit)
     is_unexplained = bool({Reason.MODEL_MISFIT, Reason.RESIDUALS_COLOURED} & set(reasons))
-    if fit.off_bridge_m < SHORTEST_APPROACH_M and (fit.has_two_roads or is_unexplained):
+    if fit.off_bridge_m < SHORTEST_APPROACH_M and (fit.has_mismatch or is_unexplained):
         reasons.append(Reason.APPROACH_TOO_SHORT)
     if fit.prior_z and max(abs(z) for z in fit.prior_z.values()) > LARGEST_PRIOR_Z:
         reasons.append(Reason.IMPLAUSIBLE_VEHICLE)
@@ -290,7 +290,7 @@ def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
 
 def _slack(fit: Fit, kind: int, stretch: int, band: int) -> float:
     """Return the tolerated power of a residual bin, relative to the expected one."""
-    return _SLACK[band] * (_SLACK_OF_TWO_ROADS if fit.has_two_roads and kind == ROAD else 1.0)
+    return _SLACK[band] * (_SLACK_WITH_MISMATCH if fit.has_mismatch and kind == ROAD else 1.0)
 
 
 def _stretches(data: CrossingData, fit: Fit) -> NDArray[np.int64]:
@@ -330,7 +330,7 @@ def is_biased_by_mismatch(fit: Fit) -> bool:
 
     None of the fit's numbers can be used then.
     """
-    return fit.mismatch_bias > _LED_AWAY
+    return fit.mismatch_bias > _LARGEST_MISMATCH_BIAS
 
 
 def undeclared_axles(

@@ -236,7 +236,7 @@ def ambiguous_neighbours(found: Comparison | None, unresolved: Set[int]) -> tupl
 def origin_of_state(state: BridgeResult) -> str:
     """Return in a sentence from which crossings the values of a state are.
 
-    The intervals of a single crossing are narrower than those of the state: they do not have the
+    The intervals of a single crossing are narrower than those of the state: they do not include the
     variability between crossings.
     """
     used = len(state.crossings_used)
@@ -254,10 +254,10 @@ def describe_comparison(
     language: Language = ENGLISH,
     without: Collection[Stated] = (),
 ) -> list[str]:
-    """Return sentences on the comparison; of unresolved elements they state only that.
+    """Return sentences on the comparison; unresolved elements are named without a change.
 
     `unresolved` are their numbers; with them, or with some that the baseline does not resolve, the
-    `level` of the bridge is stated. The caller states `without` itself.
+    `level` of the bridge is stated. The sentences `without` are left to the caller.
     """
     every = unresolved if found is None else unresolved | found.unresolved_before
     if found is None or not every:
@@ -308,7 +308,7 @@ def describe_weak_before(weak: Sequence[Element], language: Language = ENGLISH) 
 
 
 def possibly_weak(found: Comparison | None, unresolved: Set[int]) -> tuple[Element, ...]:
-    """Return the resolved elements whose interval excludes no loss, but not a small one."""
+    """Return the resolved elements whose interval excludes zero, but includes a small loss."""
     lower = () if found is None else found.lower
     return tuple(element for element in lower if element.number not in unresolved)
 
@@ -316,7 +316,7 @@ def possibly_weak(found: Comparison | None, unresolved: Set[int]) -> tuple[Eleme
 def describe_possibly_weak(
     elements: Sequence[Element], language: Language = ENGLISH
 ) -> Iterator[str]:
-    """Yield the elements whose interval excludes no loss, but not a small one; nothing if none."""
+    """Yield a sentence on the elements that are possibly weak; nothing if none is."""
     if elements:
         yield language.choice(
             "caution.lower",
@@ -375,7 +375,8 @@ def sentences(
 def smallest_detectable(key: str, elements: Sequence[Element], language: Language) -> str:
     """Return the sentence on the loss that is detectable in each of the elements.
 
-    Ends are often known far worse than the rest: where losses differ, both are named.
+    Ends are often known far worse than the rest: where losses differ, the smallest and the largest
+    are stated.
     """
     worst = max(elements, key=lambda element: element.detectable_loss)
     best = min(elements, key=lambda element: element.detectable_loss)
@@ -391,7 +392,7 @@ def per_cent_up(share: float) -> int:
 
 
 def _change(how: str, found: Comparison, element: Element, language: Language) -> str:
-    """Return the sentence on one clear element; a loss is positive, and so is a gain."""
+    """Return the sentence on one clear element; losses and gains are stated without a sign."""
     place = language.text("element", **element._asdict())
     change = sorted(100.0 * abs(1.0 - end) for end in (element.low, element.high))
     return language.text(

@@ -42,7 +42,7 @@ _CONTRADICTION = 1.2
 """Factor between the fitted first frequency and the declared one that is a contradiction: an
 estimate from the span or another temperature is within it."""
 _UNEXPLAINED_CHI2 = 3.0
-"""Value of chi2 off the bridge, fitted to that alone, from which the truck is not explained."""
+"""Smallest chi2 of a fit off the bridge alone that shows an error in the model of the truck."""
 
 FAR_FROM_MEASUREMENT: Final = "it ended at values far from the measurement"
 _ENDINGS: Final[Mapping[Termination, str]] = {
@@ -75,7 +75,7 @@ def reasons_of_fit(
     if Reason.MODEL_MISFIT in reasons or (slipped and found.unfinished is not None):
         off_bridge_chi2 = fit_off_bridge(found).chi2
     if found.unfinished is not None and off_bridge_chi2 <= EXPLAINED_CHI2:
-        slipped = {}  # a channel that steps would not be explained before and after the bridge
+        slipped = {}  # a step in a channel would leave residuals off the bridge, too
     reasons = [*slipped, *reasons]
     if found.ending is not Termination.CONVERGED:
         reasons.append(Reason.NOT_CONVERGED)

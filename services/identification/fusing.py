@@ -54,7 +54,10 @@ class FusedBridge(NamedTuple):
 def stored(
     data: CrossingData, found: Optimum, points: Floats | None = None
 ) -> fusion.FusionLikelihood:
-    """Return the likelihood of a crossing as a part of its result; `points` are as there."""
+    """Return the likelihood of a crossing as a part of its result.
+
+    `points` are those of `pre_core.fusion.likelihood.likelihood`.
+    """
     likelihood = of_crossing.likelihood(found, points=points)
     priors = found.problem.priors
     absence = dict(
@@ -81,26 +84,26 @@ def stored(
     )
 
 
-def _stored_bends(of: CurvatureTerms | None) -> fusion.Bends | None:
-    if of is None:
+def _stored_bends(terms: CurvatureTerms | None) -> fusion.Bends | None:
+    if terms is None:
         return None
-    shapes = _rounded(of.shapes.ravel(), _FEW_DIGITS)
-    directions = _rounded(of.directions.ravel())
+    shapes = _rounded(terms.shapes.ravel(), _FEW_DIGITS)
+    directions = _rounded(terms.directions.ravel())
     return fusion.Bends(
-        about=_rounded(of.about),
+        about=_rounded(terms.about),
         directions=directions,
         shapes=shapes,
-        logarithms=of.logarithms,
+        logarithms=terms.logarithms,
     )
 
 
-def _stored_short_waves(of: ShortWaveResponse | None) -> fusion.ShortWaves | None:
-    if of is None:
+def _stored_short_waves(response: ShortWaveResponse | None) -> fusion.ShortWaves | None:
+    if response is None:
         return None
     return fusion.ShortWaves(
-        step_cycles_per_m=of.step_cycles_per_m,
-        cosine=_rounded(of.cosine.ravel(), _FEW_DIGITS),
-        sine=_rounded(of.sine.ravel(), _FEW_DIGITS),
+        step_cycles_per_m=response.step_cycles_per_m,
+        cosine=_rounded(response.cosine.ravel(), _FEW_DIGITS),
+        sine=_rounded(response.sine.ravel(), _FEW_DIGITS),
     )
 
 
@@ -109,7 +112,7 @@ def _rounded(values: Floats, digits: int = _DIGITS) -> tuple[float, ...]:
 
 
 def _coordinates(
-    of: of_crossing.Coordinates, absence: dict[str, float]
+    coordinates: of_crossing.Coordinates, absence: dict[str, float]
 ) -> tuple[fusion.Coordinate, ...]:
     return tuple(
         fusion.Coordinate(
@@ -119,7 +122,7 @@ def _coordinates(
             is_log=bool(is_log),
             absence=absence.get(name, 0.0),
         )
-        for name, location, scale, is_log in zip(*of, strict=True)
+        for name, location, scale, is_log in zip(*coordinates, strict=True)
     )
 
 
@@ -211,23 +214,23 @@ def _tracks(found: FusedDraws, vehicles: Mapping[str, str]) -> tuple[Track, ...]
 
 
 def _is_like(one: fusion.FusionLikelihood, other: fusion.FusionLikelihood) -> bool:
-    """Return whether they have the same parameters of a bridge."""
+    """Return whether two likelihoods have the same parameters of a bridge."""
 
-    def what(of: fusion.FusionLikelihood) -> object:
-        names = tuple((c.name, c.is_log) for c in of.bridge)
-        return names, of.element_lengths_m
+    def bridge_parameters(likelihood: fusion.FusionLikelihood) -> object:
+        names = tuple((c.name, c.is_log) for c in likelihood.bridge)
+        return names, likelihood.element_lengths_m
 
-    return what(one) == what(other)
+    return bridge_parameters(one) == bridge_parameters(other)
 
 
-def _priors(of: fusion.FusionLikelihood) -> BridgePriors:
-    elements = len(of.element_lengths_m)
+def _priors(likelihood: fusion.FusionLikelihood) -> BridgePriors:
+    elements = len(likelihood.element_lengths_m)
     names = parameters.names(elements)
     power = dict(zip(names, parameters.mass_powers(elements).tolist(), strict=True))
     return BridgePriors(
-        _from_stored(of.bridge),
-        np.array([power[c.name] for c in of.bridge]),
-        log_odds(np.array([c.absence for c in of.bridge])),
+        _from_stored(likelihood.bridge),
+        np.array([power[c.name] for c in likelihood.bridge]),
+        log_odds(np.array([c.absence for c in likelihood.bridge])),
         elements,
     )
 
@@ -242,26 +245,28 @@ def _from_stored(coordinates: Sequence[fusion.Coordinate]) -> of_crossing.Coordi
 
 
 def _part(source: Source, coordinates: of_crossing.Coordinates) -> FusionInput:
-    of = source.likelihood
-    m = len(of.target)
+    stored_likelihood = source.likelihood
+    m = len(stored_likelihood.target)
     root = np.zeros((m, m))
-    root[np.triu_indices(m)] = of.root
+    root[np.triu_indices(m)] = stored_likelihood.root
     likelihood = of_crossing.CrossingLikelihood(
         root,
-        np.array(of.target),
-        _from_stored(of.bridge),
-        _from_stored(of.truck),
-        _knots(of, m),
-        np.array(of.level_m3),
-        _off_bridge(of),
-        _bends(of),
-        _short_waves(of),
+        np.array(stored_likelihood.target),
+        _from_stored(stored_likelihood.bridge),
+        _from_stored(stored_likelihood.truck),
+        _knots(stored_likelihood, m),
+        np.array(stored_likelihood.level_m3),
+        _off_bridge(stored_likelihood),
+        _bends(stored_likelihood),
+        _short_waves(stored_likelihood),
     )
-    likelihood = of_crossing.in_coordinates(likelihood, coordinates, len(of.element_lengths_m))
+    likelihood = of_crossing.in_coordinates(
+        likelihood, coordinates, len(stored_likelihood.element_lengths_m)
+    )
     # A truck whose site file has changed may be another one.
-    key = [[c.name, c.location, c.scale] for c in of.truck]
-    truck = f"{source.vehicle} {key} {of.footprints} {of.mass_spread}"
-    front, rear = (Footprint(**axle.model_dump()) for axle in of.footprints)
+    key = [[c.name, c.location, c.scale] for c in stored_likelihood.truck]
+    truck = f"{source.vehicle} {key} {stored_likelihood.footprints} {stored_likelihood.mass_spread}"
+    front, rear = (Footprint(**axle.model_dump()) for axle in stored_likelihood.footprints)
     road = source.road
     return FusionInput(
         source.crossing_id,
@@ -269,50 +274,52 @@ def _part(source: Source, coordinates: of_crossing.Coordinates) -> FusionInput:
         truck,
         source.direction,
         (front, rear),
-        of.mass_spread,
+        stored_likelihood.mass_spread,
         None if road is None else Profile(np.array(road.x_m), np.array(road.mean_m)),
     )
 
 
-def _knots(of: fusion.FusionLikelihood, m: int) -> Floats:
-    if of.first_knot_m is None:
+def _knots(likelihood: fusion.FusionLikelihood, m: int) -> Floats:
+    if likelihood.first_knot_m is None:
         return np.zeros(0)
-    bends = _bends(of)
-    count = m - len(of.bridge) - len(of.truck)
+    bends = _bends(likelihood)
+    count = m - len(likelihood.bridge) - len(likelihood.truck)
     if bends is not None:
         count -= 1 + bends.shapes.shape[0]
-    return of.first_knot_m + of.knot_spacing_m * np.arange(count, dtype=np.float64)
+    return likelihood.first_knot_m + likelihood.knot_spacing_m * np.arange(count, dtype=np.float64)
 
 
-def _bends(of: fusion.FusionLikelihood) -> CurvatureTerms | None:
-    if of.bends is None:
+def _bends(likelihood: fusion.FusionLikelihood) -> CurvatureTerms | None:
+    if likelihood.bends is None:
         return None
-    moves = len(of.bridge) + 1
-    shapes = np.array(of.bends.shapes).reshape(-1, moves * (moves + 1) // 2)
-    directions = np.array(of.bends.directions).reshape(-1, moves)
-    if of.bends.size:
-        directions = np.diag(of.bends.size)
-    return CurvatureTerms(np.array(of.bends.about), directions, shapes, of.bends.logarithms)
+    moves = len(likelihood.bridge) + 1
+    shapes = np.array(likelihood.bends.shapes).reshape(-1, moves * (moves + 1) // 2)
+    directions = np.array(likelihood.bends.directions).reshape(-1, moves)
+    if likelihood.bends.size:
+        directions = np.diag(likelihood.bends.size)
+    return CurvatureTerms(
+        np.array(likelihood.bends.about), directions, shapes, likelihood.bends.logarithms
+    )
 
 
-def _short_waves(of: fusion.FusionLikelihood) -> ShortWaveResponse | None:
-    if of.short_waves is None:
+def _short_waves(likelihood: fusion.FusionLikelihood) -> ShortWaveResponse | None:
+    if likelihood.short_waves is None:
         return None
     cosine, sine = (
-        np.array(values).reshape(len(of.bridge), -1)
-        for values in (of.short_waves.cosine, of.short_waves.sine)
+        np.array(values).reshape(len(likelihood.bridge), -1)
+        for values in (likelihood.short_waves.cosine, likelihood.short_waves.sine)
     )
-    return ShortWaveResponse(of.short_waves.step_cycles_per_m, cosine, sine)
+    return ShortWaveResponse(likelihood.short_waves.step_cycles_per_m, cosine, sine)
 
 
-def _off_bridge(of: fusion.FusionLikelihood) -> long_waves.OffBridgeMismatch | None:
-    if not of.off_bridge_m:
+def _off_bridge(likelihood: fusion.FusionLikelihood) -> long_waves.OffBridgeMismatch | None:
+    if not likelihood.off_bridge_m:
         return None
     step = long_waves.OFF_BRIDGE_STEP_M
-    begin = min(one.begin_m for one in of.off_bridge_m)
-    end = max(one.begin_m + step * len(one.values) for one in of.off_bridge_m)
+    begin = min(one.begin_m for one in likelihood.off_bridge_m)
+    end = max(one.begin_m + step * len(one.values) for one in likelihood.off_bridge_m)
     values = np.full(round((end - begin) / step), np.nan)
-    for one in of.off_bridge_m:
+    for one in likelihood.off_bridge_m:
         first = round((one.begin_m - begin) / step)
         values[first : first + len(one.values)] = one.values
     return long_waves.OffBridgeMismatch(begin, values)

@@ -52,7 +52,8 @@ class Identify(Protocol):
 SLOWEST_M_PER_S = 3.0
 """Speed below which the wheels are hardly affected by the bridge's stiffness."""
 _JUDGED_ASIDE_S = 1.0
-"""Time in s before and after the bridge over which signals are judged, as for thresholds."""
+"""Time in s before and after the bridge over which signals are judged, and the thresholds were
+determined."""
 _SLOW_SHARE = 0.4
 """Share of the speed on the bridge below which the road on either side is not used."""
 

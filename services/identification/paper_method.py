@@ -55,7 +55,7 @@ class _Fit(NamedTuple):
     theta: Floats  # (p,)
     free: NDArray[np.int64]  # (f,)
     covariance: Floats  # (f, f) in physical units
-    spread: Floats | None  # (f, 3) quantiles where the method has a cloud instead of a curvature
+    spread: Floats | None  # (f, 3) quantiles of the random walk's particles
     ending: loop.Termination
     diagnostics: dict[str, float]
 

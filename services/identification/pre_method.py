@@ -299,7 +299,7 @@ def _values(
     at = posterior.values_of(problem, flat)
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(10**9,)))
     # The total mass scales every force and stiffness of truck and bridge alike; no residual shows
-    # its error. That of the common gain is among the unknowns.
+    # its error. The common gain, in contrast, is an estimated parameter.
     mass_spread = data.vehicle.spread("total_mass_kg")
     scale = np.exp(mass_spread * rng.standard_normal(flat.shape[0]))
     names = parameters.names(data.bridge.elements, first_axle(data.vehicle))

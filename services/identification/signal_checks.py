@@ -22,9 +22,9 @@ LONGEST_HOLD_S = 0.2
 """Longest constant signal in s; a coarse converter (12 bits) holds a value for 0.03 s."""
 ALIKE = 1e-3
 """Relative difference below which two channels are identical."""
-_PILE_UP = 8.0
-_PILE_VISITS = 3
-"""Fault-free: at most 5.8 over three visits; a range of half the required one: 12 to 67."""
+_PILE_UP, _PILE_VISITS = 8.0, 3
+"""Limits of `SaturationEvidence.ratio` and `visits`. Fault-free: a ratio of at most 5.8 over three
+visits; half the required range: 12 to 67."""
 _REPEATS = 4
 """Number of exact repetitions of an extreme at the end of a range: noise repeats none."""
 SPIKE_HEIGHT = 20.0
@@ -32,19 +32,18 @@ SPIKE_HEIGHT = 20.0
 LARGEST_MEAN_M_PER_S2 = 0.3 * STANDARD_GRAVITY_M_PER_S2
 """Mean that indicates gravity or a broken sensor: no truck falls for seconds."""
 MAX_UNEXPLAINED = 0.3
-_BETTER = 0.5
-"""Share of the body's motion that the body equations leave unexplained.
+"""Largest share of the body's motion that the body equations may leave unexplained.
 
 Fault-free: at most 0.10; two channels swapped or one inverted: at least 0.36, and then at most
 0.10 after correction.
 """
+_BETTER = 0.5
+"""Ratio of unexplained shares below which another order or sign of channels explains more."""
 _LEAD = 0.6
 """Correlation of the axles' motions at one chainage.
 
 Fault-free: 0.71 to 0.99 (with the axles swapped: -0.72 to 0.49).
 """
-
-
 _FOLLOWS = 0.25
 """Correlation of a tandem's axles at one place, and of the body in front with a mass on its springs
 over their road. Axles: fault-free 0.34 to 0.77, swapped -0.30 to 0.15. Body, of 30 drawn crossings:
@@ -205,7 +204,7 @@ def of_tandem(
     after the first, and both after the body in front.
     """
     tandem = vehicle.tandem
-    assert tandem is not None  # noqa: S101 - the caller saw to it
+    assert tandem is not None  # noqa: S101 - the caller has checked
     names, constants = placed.middle_names(vehicle), body_constants(vehicle)
 
     def bogie(of: Floats) -> Floats:

@@ -198,8 +198,8 @@ def test_a_short_approach_is_named_where_the_roads_seem_to_differ() -> None:
     data = crossing()
     white = np.random.default_rng(3).standard_normal((ROWS, 3))
     for changes, named in (
-        ({"off_bridge_m": 11.0, "has_two_roads": True}, True),
-        ({"off_bridge_m": 13.0, "has_two_roads": True}, False),
+        ({"off_bridge_m": 11.0, "has_mismatch": True}, True),
+        ({"off_bridge_m": 13.0, "has_mismatch": True}, False),
         ({"off_bridge_m": 11.0}, False),
         ({"off_bridge_m": 11.0, "chi2_per_dof": 1.5}, True),
     ):
