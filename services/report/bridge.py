@@ -100,9 +100,9 @@ def bridge_reports(
 
     Of a crossing in several files the newest result counts (see `newest_of_each`). The numbers of a
     bridge are those of the state with the newest crossing; if other files have good crossings of
-    its realm that are not in it, all are fused. `baseline` is a results file with which to compare,
-    read or not; otherwise the one that the site file names, in the folder of `site_file`, the one
-    that was given (default: in that of the results). `validations` is the folder of validation
+    its realm that are not in it, all are fused. `baseline` is the results file to compare with, as
+    a path or already read; by default the site file names it, relative to the folder of `site_file`
+    if one was given, else to that of the results. `validations` is the folder of validation
     records. Raise InputError if a baseline does not fit, or results do not fit their site file.
     """
     for path, results, site in files:
@@ -202,7 +202,7 @@ def _latest_state(
 def _state_of_all(
     name: str, state: BridgeResult | None, crossings: Sequence[CrossingResult]
 ) -> BridgeResult | None:
-    """Return a state of all good crossings of the newest one's realm, fused again if one lacks."""
+    """Return a state with all good crossings of the newest realm, fused again if it lacks any."""
     realm = crossings[-1].realm
     good = [c for c in crossings if c.realm == realm and c.verdict == "good"]
     fusable = {c.crossing_id for c in good if c.fusion_likelihood is not None}
@@ -355,7 +355,7 @@ def _but_implausible(found: Comparison, language: Language) -> str:
 
 
 def _why_open(view: BridgeView, found: Comparison, language: Language) -> str | None:
-    """Return why a loss may have been missed; None where one of each element would be clear."""
+    """Return why a loss may have been missed; None where a loss of any element would be clear."""
     vague, before = sorted(view.vague), "_before" if found.unresolved_before else ""
     if 2 * len(vague) > len(found.elements):
         return language.text(f"finding.open{before}")

@@ -34,7 +34,7 @@ from services.report.place import ends_of
 from services.viewer.bridge_view import BridgeView
 
 _LIKELY = 0.9
-"""Probability from which a restrained or yielding end is stated on the first page."""
+"""Probability from which a restrained end or a compliant bearing is stated on the first page."""
 _MOST = 0.99
 """Largest probability that is stated: draws cannot show certainty."""
 _APART_DAYS = 30
@@ -199,7 +199,7 @@ def _combined(combined: CombinedSurveys | None, language: Language) -> Iterator[
 
 
 def _ends(measured: CautionBasis, language: Language) -> Iterator[str]:
-    """Yield which ends are likely to be restrained or to yield, unless that is declared."""
+    """Yield which ends are probably restrained or compliant, unless a restraint is declared."""
     known = [crossing.derived for crossing in measured.crossings if crossing.derived is not None]
     is_declared = [bearing == "sprung" for bearing in measured.bridge.bearings]
     for name, values in (

@@ -52,9 +52,10 @@ class SurveyFile(NamedTuple):
 
 
 class CombinedSurveys(NamedTuple):
-    """Two surveys that one state combines; the pause between them in s since 1970."""
+    """Two surveys that one state combines."""
 
     earlier_s: float
+    """Last entry of the earlier survey in s since 1970 UTC; `later_s` is the first of the later."""
     later_s: float
     command: str | None
     """Command that compares them; None if their results are in one file."""

@@ -28,7 +28,7 @@ def tag(name: str, /, *children: str, **attributes: str) -> Html:
 
 
 def joined(*children: str) -> Html:
-    """Return several pieces, one after the other; no line begins with a % or within an option."""
+    """Return several pieces joined; no line breaks before a % or within a command's option."""
     return Html("".join(c if isinstance(c, Html) else _unbroken(escape(c)) for c in children))
 
 

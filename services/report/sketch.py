@@ -56,7 +56,7 @@ def sketch(report: BridgeReport, language: Language) -> Html:
 
 
 def _point(angle: float, along: float, right: float) -> str:
-    """Return a point by its way along the bridge and to the right of it, north at the top."""
+    """Return a point by its distances along the bridge and to the right of it, north at the top."""
     east = along * math.sin(angle) + right * math.cos(angle)
     north = along * math.cos(angle) - right * math.sin(angle)
     return f"{_SIZE / 2.0 + east:.1f},{_SIZE / 2.0 - north:.1f}"
