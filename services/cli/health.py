@@ -69,7 +69,8 @@ def health_command(
         notes.append(f"one of {senders} services of this name; give each one another --id")
     if age_s < -_AHEAD_S:
         notes.append(f"its clock is {-age_s:.0f} s ahead of this machine's")
-    return "; ".join([f"{service} in realm {realm} is well, {max(age_s, 0.0):.0f} s ago", *notes])
+    well = f"{service} in realm {realm} is well (health sent {max(age_s, 0.0):.0f} s ago)"
+    return "; ".join([well, *notes])
 
 
 def silence_hint(where: str, tls: Path | None) -> str:

@@ -115,15 +115,15 @@ def _legend_of_elements(crossings: int) -> Iterator[str]:
     """Yield a line for each column of the first table, and how to read all of them."""
     wanted = percent(DETECTION_PROBABILITY)
     yield "±          standard deviation of EI; near 55 % the measurement adds nothing"
-    yield f"           (from {DRAWS:,} draws, which give it to 2 % of itself)"
+    yield f"           (from {DRAWS:,} draws, with a relative error of 2 %)"
     yield "seen       probability that the loss is detected against the nominal value"
     yield "vs others  probability that the loss is detected against the other elements"
     yield f"smallest   smallest loss that is detected with {wanted} probability"
     yield f"clear      smallest loss that a report calls clear with {wanted} probability:"
     yield f"           the whole 95 % interval is more than {percent(CLEAR_LOSS)} below the others"
     yield f"detected   by a one-sided test with {percent(FALSE_ALARM)} false alarms"
-    yield "Next to supports, whose restraint is unknown, less is seen against the nominal"
-    yield "value than the same ± elsewhere suggests."
+    yield "Next to supports of unknown restraint, seen is lower than the same ± suggests"
+    yield "elsewhere."
     yield f"Two compared surveys of {crossings} crossings have √2 times the ± of one, so each needs"
     yield "at least twice the crossings stated here, and more for a clear change."
 
@@ -132,7 +132,8 @@ def _legend_of_changes(crossings: int, middle: int, *, has_speeds: bool) -> Iter
     """Yield a line for each column and row of the second table."""
     wanted = percent(DETECTION_PROBABILITY)
     yield f"overall    standard deviation of the overall stiffness after {crossings} crossings"
-    yield "mid        standard deviation of EI at midspan; smallest is there, too"
+    yield "mid        standard deviation of EI at midspan"
+    yield f"smallest   smallest loss at midspan that is detected with {wanted} probability"
     yield f"needed     crossings that detect the loss at midspan with {wanted} probability"
     yield "ends       crossings that detect it at both ends; other elements lie in between"
     yield "report     crossings after which a report calls the loss at midspan clear"
@@ -151,10 +152,10 @@ def _not_advised(found: SurveyForecast) -> Iterator[str]:
     """Yield which rows the advice leaves out, and why."""
     if found.planned.plan.site.vehicles[0].tandem is None:
         yield "The advice does not rank tandems, whose forecast is too optimistic, nor fewer"
-        yield "elements, because a loss in a longer element is more damage."
+        yield "elements, because the same loss in a longer element is more damage."
     else:
-        yield "The advice does not rank fewer elements, because a loss in a longer element is"
-        yield "more damage."
+        yield "The advice does not rank fewer elements, because the same loss in a longer"
+        yield "element is more damage."
 
 
 def _aligned(rows: list[list[str]]) -> Iterator[str]:

@@ -44,7 +44,7 @@ class HealthOptions(OnTheBus):
     endpoint: str | None = endpoint_option()
     tls: Path | None = tls_option()
     realm: str = opt(
-        "realm of the service; live for a logger of several realms or a pattern (default: live)",
+        "realm of the service (default: live, where a logger of several realms or a pattern is)",
         default="live",
     )
 

@@ -150,7 +150,7 @@ class ValidateOptions:
         metavar="all|twin,steady,…",
     )
     truth: Path = opt(
-        "folder of folders with crossings of another simulator and their truth.json "
+        "folder with a subfolder for each crossing of another simulator, with its truth.json "
         "(default: ../shared/crossings)",
         Path,
         default=Path("../shared/crossings"),

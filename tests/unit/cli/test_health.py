@@ -77,7 +77,7 @@ def test_clock_of_a_service_that_is_ahead_is_reported(endpoint: str) -> None:
         line = health_command(service="logger", endpoint=endpoint, tls=None, realm="live")
         publisher.close()
     start, clock = line.rsplit("; ", 1)
-    assert start == "logger in realm live is well, 0 s ago; disk"
+    assert start == "logger in realm live is well (health sent 0 s ago); disk"
     assert clock.startswith("its clock is 3")
     assert clock.endswith(" s ahead of this machine's")
 
@@ -114,5 +114,5 @@ def test_services_of_one_name_are_counted(endpoint: str) -> None:
             )
         for publisher in publishers:
             publisher.close()
-    assert lines[0] == "worker in realm live is well, 0 s ago"
+    assert lines[0] == "worker in realm live is well (health sent 0 s ago)"
     assert lines[1] == f"{lines[0]}; one of 2 services of this name; give each one another --id"

@@ -217,10 +217,10 @@ def test_tandem_that_does_not_help_is_not_advised() -> None:
 
 def test_legend_says_why_equal_deviations_are_seen_unequally() -> None:
     text = " ".join(lines_of(forecast((9, 40, 0.2))))
-    assert "Next to supports, whose restraint is unknown, less is seen" in text
+    assert "Next to supports of unknown restraint, seen is lower" in text
 
 
 def test_forecast_states_the_draws_behind_its_deviations() -> None:
     found = forecast((9, 40, 0.2))
-    assert "(from 2,000 draws, which give it to 2 % of itself)" in " ".join(lines_of(found))
+    assert "(from 2,000 draws, with a relative error of 2 %)" in " ".join(lines_of(found))
     assert as_json(found)["draws"] == 2000
