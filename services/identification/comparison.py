@@ -243,7 +243,7 @@ def origin_of_state(state: BridgeResult) -> str:
     if used > 1:
         return f"Values from {used} fused crossings."
     if state.between_crossing_std is not None:
-        return "Values from one crossing; its own figure has no between-crossing variability."
+        return "Values from one crossing; its own figure excludes between-crossing variability."
     return "Values from one crossing."
 
 

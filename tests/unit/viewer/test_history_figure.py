@@ -80,8 +80,8 @@ def test_reference_is_the_first_good_period_of_the_same_elements() -> None:
 def test_element_that_was_weak_from_the_beginning_is_named() -> None:
     low = weeks(0.5, 0.5)
     sentence = (
-        "EI_2: below 75 % of the median of the elements from the start; a loss before that is not "
-        "shown here"
+        "EI_2: already below 75 % of the elements' median in this reference; an earlier loss is "
+        "not shown here"
     )
     for points, is_named in ((low, True), (weeks(0.9, 0.5), False)):
         texts = [text.get_text() for text in drawn(HistoryView("b", "week", points, (), ())).texts]

@@ -96,7 +96,7 @@ def test_the_overview_has_the_picture_of_the_bridge_and_the_finding(
         (
             ("a",),
             0.02,
-            "Values from one crossing; its own figure has no between-crossing variability.",
+            "Values from one crossing; its own figure excludes between-crossing variability.",
         ),
         (("a",), None, "Values from one crossing."),
         (("a", "b"), 0.02, "Values from 2 fused crossings."),
