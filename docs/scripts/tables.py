@@ -262,7 +262,7 @@ _RESULTS: tuple[tuple[str, type[BaseModel]], ...] = (
     ("`mismatch`", results.RoadMismatch),
     ("`fusion_likelihood`", fusion.FusionLikelihood),
     ("`bridges`", results.BridgeResult),
-    ("`EI_1` … (N·m²), `level`, `thirds` (of nominal) of a bridge", results.ElementState),
+    ("`EI_1` … (N·m²), `level`, `thirds` (relative to nominal) of a bridge", results.ElementState),
     ("`tracks`", results.Track),
     ("`crossings_left_out`", results.LeftOut),
 )

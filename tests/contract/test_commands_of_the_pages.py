@@ -159,7 +159,6 @@ NOT_RUN = {
         "needs a browser; tests/unit/report prints where there is one"
     ),
     "python tests/numerics/table.py": LONG,
-    "make tables": "tests/contract/test_tables.py compares the pages",
     "python -m studies.scripts.reproduction frequencies": LONG,
     "python -m studies.scripts.pavement --crossings 4": LONG,
     "python -m studies.scripts.pavement --crossings 2 --decks 2.5 --joints 15 --anisotropy 3.5": (
