@@ -188,7 +188,7 @@ def detect_change(
             state, chart = _without_unlikely_scales(state, chart)
             stay = {*chart.begins, *kept_for}
             before = {begin_at: one for begin_at, one in before.items() if begin_at in stay}
-        else:  # an alarm stands: later periods estimate its size and nothing else
+        else:  # an alarm is active: later periods only estimate its size
             standing = _since(standing, [period], is_first=False)
         if notes and number + 1 >= notes[0].at:
             note = notes.pop(0)

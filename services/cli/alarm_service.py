@@ -12,7 +12,7 @@ from services.bus.playback import leave_at_once, stopped_by_signals
 from services.bus.publisher import Publisher
 from services.bus.session import wait_for_router
 from services.common.errors import FailureError, InputError
-from services.history.alarm_files import acknowledged_since, alarms_of, standing_alarms
+from services.history.alarm_files import acknowledged_since, active_alarms, alarms_of
 from services.history.alarms import AlarmCheck
 
 _log = logging.getLogger(__name__)
@@ -34,16 +34,16 @@ class AlarmPublisher:
 
     def __init__(self, put: Callable[[Alarm, bytes], None]) -> None:
         self._put = put
-        self._standing: dict[tuple[str, str], Alarm] | None = None
+        self._active: dict[tuple[str, str], Alarm] | None = None
         """Published alarms; None before the first publication."""
 
     def publish_changes(self, folder: Path, time_ns: int) -> None:
         """Publish the changes since the last call."""
-        now = {(alarm.realm, alarm.bridge): alarm for alarm in standing_alarms(folder)[0]}
-        if self._standing is None:
+        now = {(alarm.realm, alarm.bridge): alarm for alarm in active_alarms(folder)[0]}
+        if self._active is None:
             for alarm in acknowledged_since(folder, time_ns / 1e9 - _REMEMBERED_S):
                 self._put(alarm, encode_alarm(alarm, time_ns))
-        before = self._standing or {}
+        before = self._active or {}
         for whose, alarm in before.items():
             if whose in now and now[whose].alarm_id == alarm.alarm_id:
                 continue
@@ -53,7 +53,7 @@ class AlarmPublisher:
         for whose, alarm in now.items():
             if whose not in before or before[whose].alarm_id != alarm.alarm_id:
                 self._put(alarm, encode_alarm(alarm, time_ns))
-        self._standing = now
+        self._active = now
 
 
 def serve(
@@ -62,7 +62,7 @@ def serve(
     """Check the history at intervals and publish its alarms, until a signal; return 0.
 
     InputError or FailureError: the first check of the history fails. A later failure is logged and
-    the check is repeated; standing alarms are published all the same.
+    the check is repeated; active alarms are published all the same.
     """
     publishers: dict[str, Publisher] = {}
     with stopped_by_signals(leave_at_once) as stop, contextlib.ExitStack() as stack:

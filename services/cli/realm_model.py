@@ -85,7 +85,7 @@ class CrossingRow(NamedTuple):
     forward: bool
     entry_ns: int
     state: str
-    """State on the way to its result; then the verdict."""
+    """State of its identification; once it has a result, the verdict."""
     fraction: float | None = None
     ratios: tuple[float, ...] = ()
     """EI of each element over nominal."""
@@ -284,7 +284,7 @@ class RealmModel:
         if before == alarm:
             return None  # it is republished after a restart of its service
         if before is None and len(self.alarms) >= _MAX_BRIDGES:
-            self.alarms.pop(min(self.alarms, key=lambda name: _weight(self.alarms[name])))
+            self.alarms.pop(min(self.alarms, key=lambda name: _order_of_removal(self.alarms[name])))
         self.alarms[alarm.bridge] = alarm
         return f"alarm of {alarm.bridge}, {alarm_state(alarm)}: {alarm.sentence()}"
 
@@ -341,8 +341,8 @@ def _named(row: CrossingRow) -> str:
     return f"{route_text(row)}, entry {utc_second(row.entry_ns * 1e-9)}"
 
 
-def _weight(alarm: Alarm) -> tuple[bool, float]:
-    """Return a weight whose least goes first: acknowledged before standing, then the oldest."""
+def _order_of_removal(alarm: Alarm) -> tuple[bool, float]:
+    """Return a sort key for removal: acknowledged alarms before active ones, then the oldest."""
     return alarm.acknowledged is None, alarm.raised
 
 

@@ -118,8 +118,8 @@ def page(
     if model.bridges and not alarms:
         parts.append(Text(NO_ALARM, style="dim", no_wrap=True, overflow="ellipsis"))
     if model.bridges:
-        standing = {name for name, one in model.alarms.items() if one.acknowledged is None}
-        parts.append(_bridges(model.bridges, standing))
+        active = {name for name, one in model.alarms.items() if one.acknowledged is None}
+        parts.append(_bridges(model.bridges, active))
     if model.services:
         parts.append(_services(model, silent, now_ns, is_connected=listening.lost_s is None))
     spaced = [
@@ -293,11 +293,11 @@ def _crossings(rows: Sequence[CrossingRow], held: Set[str], *, is_wide: bool) ->
     return table
 
 
-def _bridges(bridges: dict[str, BridgeRow], standing: Set[str]) -> Table:
-    """Return the bridges: with a standing alarm first, then by the latest message."""
+def _bridges(bridges: dict[str, BridgeRow], active: Set[str]) -> Table:
+    """Return the bridges: with an active alarm first, then by the latest message."""
     table = _table("bridge", "crossings", "EI", "all crossings fused")
-    alarmed = [name for name in bridges if name in standing][-_MAX_BRIDGES:]
-    quiet = [name for name in bridges if name not in standing]
+    alarmed = [name for name in bridges if name in active][-_MAX_BRIDGES:]
+    quiet = [name for name in bridges if name not in active]
     for name in (*alarmed, *quiet[max(0, len(quiet) + len(alarmed) - _MAX_BRIDGES) :]):
         row = bridges[name]
         wording = row.finding or row.lowest
@@ -305,13 +305,13 @@ def _bridges(bridges: dict[str, BridgeRow], standing: Set[str]) -> Table:
         found = Text(wording if is_good else f"{row.verdict}: {wording}", overflow="fold")
         found.no_wrap = False
         heights = bars(row.ratios, row.weak, doubtful=not is_good)
-        head = Text(name, style="bold red" if name in standing else "")
+        head = Text(name, style="bold red" if name in active else "")
         table.add_row(head, f"{row.used}", heights, found)
     return table
 
 
 def _alarms(alarms: Iterable[Alarm], most: int) -> list[Text]:
-    """Return a line for each alarm, standing ones first, for readers of the first lines."""
+    """Return a line for each alarm, active ones first, for readers of the first lines."""
     known = sorted(alarms, key=lambda one: (one.acknowledged is not None, -one.raised, one.bridge))
     lines = [
         Text(
@@ -323,9 +323,9 @@ def _alarms(alarms: Iterable[Alarm], most: int) -> list[Text]:
         for one in known[:most]
     ]
     if len(known) > most:
-        standing = sum(one.acknowledged is None for one in known[most:])
-        more = f"  and {count_of(len(known) - most, 'more alarm')}, {standing} active"
-        lines.append(Text(more, style="red" if standing else "dim"))
+        active = sum(one.acknowledged is None for one in known[most:])
+        more = f"  and {count_of(len(known) - most, 'more alarm')}, {active} active"
+        lines.append(Text(more, style="red" if active else "dim"))
     return lines
 
 

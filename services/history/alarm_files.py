@@ -1,9 +1,9 @@
 """Files of alarms in a history: reading and acknowledging.
 
 An alarm is a file `alarms/realm=R/bridge=B/ID.json` that is written once; its acknowledgement is
-`ID.ack.json` next to it. Nothing removes either: an alarm stands until it is acknowledged, whatever
-later crossings show, and over any restart. An alarm's id is a hash of its content, so two programs
-that raise it write one file.
+`ID.ack.json` next to it. Nothing removes either: an alarm is active until it is acknowledged,
+whatever later crossings show, and over any restart. An alarm's id is a hash of its content, so two
+programs that raise it write one file.
 """
 
 from pathlib import Path
@@ -34,7 +34,7 @@ def alarms_of(folder: Path, realm: str, bridge: str) -> tuple[list[Alarm], list[
                 try:
                     note = load_json(Acknowledgement, noted, "an acknowledgement")
                     alarm = alarm.model_copy(update={"acknowledged": note})
-                except InputError as error:  # the alarm then stands
+                except InputError as error:  # the alarm then stays active
                     problems.append(str(error))
             found.append(alarm)
         except InputError as error:
@@ -61,7 +61,7 @@ def bridges_with_alarms(folder: Path) -> list[tuple[str, str]]:
     ]
 
 
-def standing_alarms(folder: Path) -> tuple[list[Alarm], list[str]]:
+def active_alarms(folder: Path) -> tuple[list[Alarm], list[str]]:
     """Return the alarms of a history without an acknowledgement, and the invalid files."""
     found, problems = [], []
     for realm, bridge in bridges_with_alarms(folder):

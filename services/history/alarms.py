@@ -1,6 +1,6 @@
 """Alarms of a history, raised where the periods of a bridge differ from earlier ones.
 
-While an alarm stands, no other of that bridge is raised. `alarm_files` holds its file.
+While an alarm is active, no other of that bridge is raised. `alarm_files` holds its file.
 """
 
 import json
@@ -23,7 +23,7 @@ from pre_core.monitoring.observation import Observation, combine_observations
 from schemas.alarms import Alarm
 from services.common.child_process import ChildPool
 from services.common.files import make_folder, write_atomically
-from services.history.alarm_files import ALARMS, alarms_folder, alarms_of, standing_alarms
+from services.history.alarm_files import ALARMS, active_alarms, alarms_folder, alarms_of
 from services.history.history_store import (
     HistoryRow,
     bridges_of,
@@ -86,7 +86,7 @@ class AlarmCheck(NamedTuple):
 
     raised: tuple[Alarm, ...]
     """Alarms that are new."""
-    standing: tuple[Alarm, ...]
+    active: tuple[Alarm, ...]
     """Alarms without an acknowledgement, new ones included."""
     bridges: int
     """Number of bridges checked."""
@@ -196,9 +196,9 @@ def check(
         raised += some
         problems += wrong
     save_markers(folder, marks)
-    now_standing, wrong = standing_alarms(folder)
+    now_active, wrong = active_alarms(folder)
     return AlarmCheck(
-        tuple(raised), tuple(now_standing), len(work), tuple(dict.fromkeys([*problems, *wrong]))
+        tuple(raised), tuple(now_active), len(work), tuple(dict.fromkeys([*problems, *wrong]))
     )
 
 
@@ -235,7 +235,7 @@ def _checked_batch(
 
 
 def _raise(folder: Path, alarm: Alarm) -> bool:
-    """Write an alarm, unless one of that bridge stands; return whether it was written."""
+    """Write an alarm, unless one of that bridge is active; return whether it was written."""
     if any(one.acknowledged is None for one in alarms_of(folder, alarm.realm, alarm.bridge)[0]):
         return False
     path = alarms_folder(folder, alarm.realm, alarm.bridge) / f"{alarm.alarm_id}.json"

@@ -67,7 +67,7 @@ def _alarms(past: BridgeHistory, language: Language) -> Iterator[Html]:
     lines = []
     for alarm in past.alarms:
         note = alarm.acknowledged
-        state = language.text("history.stands")
+        state = language.text("history.active")
         if note is not None:
             values = {"by": note.by, "day": utc_day(note.time), "note": note.note}
             which = "acknowledged_note" if note.note else "acknowledged"

@@ -103,7 +103,7 @@ class HistoryView(NamedTuple):
     points: tuple[PeriodPoint, ...]
     marks: tuple[AlarmMark, ...]
     statements: tuple[Statement, ...]
-    """Sentences where no alarm stands."""
+    """Sentences where no alarm is active."""
     baseline: StoredBaseline | None = None
 
     def reference(self, n: int) -> HistoryReference:

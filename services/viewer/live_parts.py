@@ -155,19 +155,19 @@ def log_trend(
 
 
 def bridge_text(alarm: Alarm | None, *found: str) -> str:
-    """Return the text on a bridge as Markdown: a standing alarm, then the result."""
+    """Return the text on a bridge as Markdown: an active alarm, then the result."""
     texts = [_alarm_text(alarm), "\n\n".join(filter(None, found)) or NO_RESULT]
     return "\n\n".join(filter(None, texts))
 
 
-def note_alarm(standing: dict[str, Alarm], alarm: Alarm) -> None:
+def note_alarm(active: dict[str, Alarm], alarm: Alarm) -> None:
     """Keep the alarm of each bridge until it is acknowledged, at most `_MAX_ALARMS` of them."""
-    standing.pop(alarm.bridge, None)
+    active.pop(alarm.bridge, None)
     if alarm.acknowledged is not None:
         return
-    if len(standing) >= _MAX_ALARMS:
-        standing.pop(min(standing, key=lambda bridge: standing[bridge].raised))
-    standing[alarm.bridge] = alarm
+    if len(active) >= _MAX_ALARMS:
+        active.pop(min(active, key=lambda bridge: active[bridge].raised))
+    active[alarm.bridge] = alarm
 
 
 def _alarm_text(alarm: Alarm | None) -> str:

@@ -244,7 +244,7 @@ class LiveView:
             self._draw_bridge(found.on_map, estimate.mean / nominal, moment_ns, is_doubtful)
 
     def _add_alarm(self, alarm: Alarm) -> None:
-        """Add an alarm. It stands for months: a truck gives a bridge a tab, an alarm does not."""
+        """Add an alarm, which may be active for months: unlike a truck it gives a bridge no tab."""
         note_alarm(self._alarms, alarm)
         if alarm.bridge in self._bridges:
             now_ns = self._time.now_ns() if self._time.latest_ns else 0

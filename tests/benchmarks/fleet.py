@@ -123,7 +123,7 @@ def night(history: Path, bridges: int) -> None:
 
 def looked(history: Path, now_s: float) -> str:
     found = check(history, AlarmSettings(), now_s, processes=2)
-    return f"{found.bridges} bridges, {len(found.standing)} alarms stand"
+    return f"{found.bridges} bridges, {len(found.active)} alarms active"
 
 
 def catalogue_bytes() -> float:

@@ -109,10 +109,10 @@ def _alarm(options: AlarmOptions) -> int:
     checked = _checked(options)
     checks, alarms = count_of(checked.bridges, "bridge"), count_of(len(checked.raised), "new alarm")
     print(f"{checks} checked, {alarms}")
-    for alarm in checked.standing:
+    for alarm in checked.active:
         print(alarm_line(alarm))
     is_complete = _print_watches(options.history) and not checked.problems
-    return _ended(options, has_alarm=bool(checked.standing), is_complete=is_complete)
+    return _ended(options, has_alarm=bool(checked.active), is_complete=is_complete)
 
 
 def _ended(options: AlarmOptions, *, has_alarm: bool, is_complete: bool) -> int:
@@ -157,18 +157,18 @@ def _list(options: AlarmOptions) -> int:
 
     folder = options.history
     bridges_of(folder)  # it raises where there is no such folder
-    number = standing = unread = 0
+    number = active = unread = 0
     for realm, bridge in bridges_with_alarms(folder):
         alarms, problems = alarms_of(folder, realm, bridge)
         for line in (*problems, *map(alarm_line, alarms)):
             print(line)
         unread += len(problems)
         number += len(alarms)
-        standing += sum(alarm.acknowledged is None for alarm in alarms)
+        active += sum(alarm.acknowledged is None for alarm in alarms)
     if not number:
         print("no alarms")
     is_complete = _print_watches(folder) and not unread
-    return _ended(options, has_alarm=bool(standing), is_complete=is_complete)
+    return _ended(options, has_alarm=bool(active), is_complete=is_complete)
 
 
 def _print_watches(folder: Path) -> bool:
@@ -204,10 +204,10 @@ def _acknowledge(options: AlarmOptions, bridge: str) -> int:
     alarms, problems = alarms_of(options.history, realm, bridge)
     for problem in problems:
         print(problem)
-    standing = [alarm for alarm in alarms if alarm.acknowledged is None]
-    if not standing:
+    active = [alarm for alarm in alarms if alarm.acknowledged is None]
+    if not active:
         raise InputError(f"{options.history}: {bridge} has no active alarm")
-    for alarm in standing:
+    for alarm in active:
         noted = acknowledge(options.history, alarm, options.by, options.note, time.time())
         print(alarm_line(noted))
     return 0

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from services.history.alarm_files import standing_alarms
+from services.history.alarm_files import active_alarms
 
 
 @pytest.mark.slow
@@ -29,7 +29,7 @@ def test_nights_after_a_loss_of_stiffness_raise_an_alarm(project: Path, tmp_path
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    (alarm,), problems = standing_alarms(tmp_path / "history")
+    (alarm,), problems = active_alarms(tmp_path / "history")
     assert (alarm.bridge, alarm.element, problems) == ("bridge-1", 4, [])
     assert alarm.direction == "weaker"
     assert alarm.ratio == pytest.approx(0.7, abs=0.06)

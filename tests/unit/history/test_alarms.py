@@ -14,7 +14,7 @@ from services.cli.alarm_service import AlarmPublisher
 from services.common.errors import InputError
 from services.common.language import language_of
 from services.history import alarms
-from services.history.alarm_files import acknowledge, alarms_of, standing_alarms
+from services.history.alarm_files import acknowledge, active_alarms, alarms_of
 from services.history.alarms import AlarmSettings, check, monitoring_states
 from services.history.history_store import add_results
 from services.history.watch_files import MonitoringState, WatchRecord, record_path
@@ -46,7 +46,7 @@ def history(made: Path, tmp_path: Path) -> Path:
 def test_the_right_alarm_and_no_other(history: Path) -> None:
     found = check(history, AlarmSettings(), AFTER_S)
     (alarm,) = found.raised
-    assert found.standing == (alarm,)
+    assert found.active == (alarm,)
     assert (found.bridges, found.problems) == (2, ())
     assert (alarm.bridge, alarm.element, alarm.direction) == ("bridge-2", 4, "weaker")
     assert alarm.since == pytest.approx(BEGIN_S + LOSES_AT * WEEK_S, abs=WEEK_S)
@@ -58,12 +58,12 @@ def test_the_right_alarm_and_no_other(history: Path) -> None:
 def test_an_alarm_is_raised_once_and_stands_over_any_restart(history: Path) -> None:
     first = check(history, AlarmSettings(), AFTER_S)
     again = check(history, AlarmSettings(), AFTER_S)
-    assert (again.raised, again.standing, again.bridges) == ((), first.standing, 0)
+    assert (again.raised, again.active, again.bridges) == ((), first.active, 0)
     everything = check(history, AlarmSettings(), AFTER_S, everything=True)
-    assert (everything.raised, everything.standing) == ((), first.standing)
+    assert (everything.raised, everything.active) == ((), first.active)
     # Whatever would be found now: it stands until somebody acknowledges it.
     sleepy = AlarmSettings(learning=500)
-    assert check(history, sleepy, AFTER_S, everything=True).standing == first.standing
+    assert check(history, sleepy, AFTER_S, everything=True).active == first.active
 
 
 def test_two_processes_find_what_one_finds(history: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,11 +82,11 @@ def test_a_period_that_is_not_over_does_not_count(history: Path) -> None:
 
 
 def test_after_it_is_acknowledged_what_is_then_is_the_baseline(history: Path) -> None:
-    (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
+    (alarm,) = check(history, AlarmSettings(), AFTER_S).active
     noted = acknowledge(history, alarm, "owner", "props were put in", alarm.raised + WEEK_S)
     assert noted.acknowledged is not None
     after = check(history, AlarmSettings(), AFTER_S, everything=True)
-    assert (after.raised, after.standing) == ((), ())
+    assert (after.raised, after.active) == ((), ())
     assert alarms_of(history, "sim-fleet", "bridge-2") == ([noted], [])
     with pytest.raises(InputError, match="is acknowledged already"):
         acknowledge(history, alarm, "somebody else", "", AFTER_S)
@@ -113,7 +113,7 @@ def test_only_a_watch_that_judged_says_that_nothing_has_changed(history: Path) -
         "larger than 5 %."
     )
     assert watch_now(history, "bridge-2").state == "alarm"
-    (alarm,) = standing_alarms(history)[0]
+    (alarm,) = active_alarms(history)[0]
     acknowledge(history, alarm, "owner", "", AFTER_S)
     assert watch_now(history, "bridge-2").state == "acknowledged"
     where = record_path(history, "sim-fleet", "bridge-1")
@@ -221,7 +221,7 @@ def test_alarms_of_earlier_versions_are_read_and_their_acknowledgement_counts(
     (where / "20250421-4-weaker.ack.json").write_text(noted)
     (history / "alarms/checked.json").write_text('{"sim-fleet/bridge-1": [1, "week", 2, 0.01, 8]}')
     found = check(history, AlarmSettings(), AFTER_S)
-    assert (found.bridges, found.raised, found.standing, found.problems) == (2, (), (), ())
+    assert (found.bridges, found.raised, found.active, found.problems) == (2, (), (), ())
     assert watch_now(history, "bridge-2").found_nothing
 
 
@@ -238,24 +238,24 @@ def test_the_smallest_change_of_interest_is_an_option(
 
 
 def test_damaged_files_of_alarms_get_a_line_and_what_stands_stands(history: Path) -> None:
-    (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
+    (alarm,) = check(history, AlarmSettings(), AFTER_S).active
     where = history / "alarms/realm=sim-fleet/bridge=bridge-2"
     (where / "noise.json").write_text("{")
     (where / f"{alarm.alarm_id}.ack.json").write_text('{"by": ""}')
     (history / "alarms/checked.json").write_text("[]")
-    found, problems = standing_alarms(history)
+    found, problems = active_alarms(history)
     assert found == [alarm]
     assert len(problems) == 2
     assert any("noise.json: not an alarm: " in line for line in problems)
     assert any(f"{alarm.alarm_id}.ack.json: by: " in line for line in problems)
-    assert check(history, AlarmSettings(), AFTER_S).standing == (alarm,)
+    assert check(history, AlarmSettings(), AFTER_S).active == (alarm,)
     newer = (where / f"{alarm.alarm_id}.json").read_text().replace('"edition": 1', '"edition": 2')
     (where / "20250101-1-weaker.json").write_text(newer)
-    assert any("20250101-1-weaker.json: edition: " in line for line in standing_alarms(history)[1])
+    assert any("20250101-1-weaker.json: edition: " in line for line in active_alarms(history)[1])
 
 
 def test_alarms_on_the_wire(history: Path) -> None:
-    (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
+    (alarm,) = check(history, AlarmSettings(), AFTER_S).active
     for one in (alarm, acknowledge(history, alarm, "owner", "looked at", AFTER_S)):
         message = pb.Alarm.FromString(encode_alarm(one, 5))
         assert alarm_of(message, "sim-fleet") == one
@@ -277,7 +277,7 @@ def test_alarm_is_published_when_raised_noted_and_restarted(
     teller = AlarmPublisher(put)
     teller.publish_changes(history, 1)
     assert reported == []
-    (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
+    (alarm,) = check(history, AlarmSettings(), AFTER_S).active
     teller.publish_changes(history, 2)
     teller.publish_changes(history, 3)
     assert reported == [("bridge-2", False)]
@@ -343,7 +343,7 @@ def test_exit_code_reports_alarms_and_failures_on_request(
 
 def test_unpublished_notes_are_published_at_the_start(history: Path) -> None:
     """Who heard the alarm stand shows it until it hears that somebody took note of it."""
-    (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
+    (alarm,) = check(history, AlarmSettings(), AFTER_S).active
     acknowledge(history, alarm, "owner", "", AFTER_S)
     reported: list[tuple[str, bool]] = []
 
@@ -360,7 +360,7 @@ def test_unpublished_notes_are_published_at_the_start(history: Path) -> None:
 def test_an_acknowledgement_that_is_damaged_can_be_given_again(
     history: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
+    (alarm,) = check(history, AlarmSettings(), AFTER_S).active
     damaged = history / f"alarms/realm=sim-fleet/bridge=bridge-2/{alarm.alarm_id}.ack.json"
     damaged.write_text("{")
     words = ["alarm", "ack", "bridge-2", "--by", "owner", "--history", str(history)]
@@ -370,7 +370,7 @@ def test_an_acknowledgement_that_is_damaged_can_be_given_again(
     assert line.endswith("; move that file away and acknowledge again")
     damaged.rename(damaged.with_suffix(".damaged"))
     assert cli.main(words) == 0
-    assert standing_alarms(history) == ([], [])
+    assert active_alarms(history) == ([], [])
 
 
 @pytest.mark.parametrize(
@@ -387,7 +387,7 @@ def test_invalid_acknowledgement_gives_one_line(
     check(history, AlarmSettings(), AFTER_S)
     assert cli.main(["alarm", "ack", "bridge-2", *output, "--history", str(history)]) == 2
     assert capsys.readouterr().err.startswith(f"driveby: {line}")
-    assert len(standing_alarms(history)[0]) == 1
+    assert len(active_alarms(history)[0]) == 1
 
 
 def test_a_note_is_one_line_and_nothing_that_a_terminal_obeys(
@@ -402,14 +402,14 @@ def test_a_note_is_one_line_and_nothing_that_a_terminal_obeys(
 
 
 def test_an_alarm_in_another_place_than_its_own_gets_a_line(history: Path) -> None:
-    (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
+    (alarm,) = check(history, AlarmSettings(), AFTER_S).active
     path = history / f"alarms/realm=sim-fleet/bridge=bridge-2/{alarm.alarm_id}.json"
     copy = path.with_name("copy.json")
     copy.write_bytes(path.read_bytes())
     elsewhere = history / f"alarms/realm=live/bridge=bridge-2/{alarm.alarm_id}.json"
     elsewhere.parent.mkdir(parents=True)
     elsewhere.write_bytes(path.read_bytes())
-    found, problems = standing_alarms(history)
+    found, problems = active_alarms(history)
     assert found == [alarm]
     for wrong in (copy, elsewhere):
         output = f"{wrong}: is alarm {alarm.alarm_id} of bridge-2 in realm sim-fleet, which"
@@ -427,7 +427,7 @@ def test_an_alarm_stands_though_its_crossings_are_gone(
     assert cli.main(["alarm", "check", "--all", *there]) == 0
     assert "active: element 4" in capsys.readouterr().out
     assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", *there]) == 0
-    assert standing_alarms(history) == ([], [])
+    assert active_alarms(history) == ([], [])
 
 
 def test_running_week_is_named_as_not_yet_complete() -> None:
