@@ -44,7 +44,7 @@ class ClockWatch:
                 first_sequence=identity.sequence,
             )
             self._due.append((where, event))
-        if not is_simulated(where.realm):  # its samples have any age: `driveby truck --speed`
+        if not is_simulated(where.realm):  # `driveby truck --speed` gives samples any age
             clock.arrived(stamp.wall_time_ns, now_ns)
         self._lag_ns = max(self._lag_ns, now_ns - stamp.wall_time_ns)
 

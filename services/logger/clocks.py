@@ -97,7 +97,7 @@ class TruckClock:
         """Return offset and drift over the last hour; None in the first minute.
 
         A clock that is ahead, or a day behind, is known at once: no delay explains either.
-        After a step, which has an event of its own, the minute is waited for.
+        After a step, which has an event of its own, the result is None for a minute.
         """
         if self._drift is not None or self._is_stepped or self._smallest is None:
             return self._drift

@@ -9,7 +9,7 @@ from schemas.topics import Key
 QUEUE_IS_FULL = "found the writer's queue full"
 FAILED = "could not be written any more"
 _MAX_SOURCES = 100
-"""Sources with their own count until the next report; others are counted together."""
+"""Largest number of sources with a count of their own in a report; others are counted together."""
 
 
 class Drop(NamedTuple):

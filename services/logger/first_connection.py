@@ -1,4 +1,4 @@
-"""Log lines on a router to which nothing connects, as with another port at its clients."""
+"""Log lines on a router to which nothing connects, for example because clients use another port."""
 
 import logging
 import time

@@ -1,4 +1,4 @@
-"""The logger's line of its own log on its health."""
+"""The line on the logger's health in its own log."""
 
 from collections import defaultdict
 from collections.abc import Mapping

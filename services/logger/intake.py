@@ -34,7 +34,7 @@ _RATE_ON_OCCASION_HZ = 100.0
 _LEAST_BURST = 1000
 """Number of messages that a restored link may bring at once, whatever the stream."""
 _MAX_REFUSED_SOURCES = 100
-"""Sources with their own count until the next report; refusals of others are counted together."""
+"""Largest number of sources with a count of their own in a report; others are counted together."""
 _REFUSALS_PERIOD_S = 60.0
 """Interval of events on refusals of one source, with a count."""
 _RECENT = 256

@@ -13,7 +13,7 @@ _PERIOD_S = 60.0
 class RateLimitedLog:
     """A thread-safe log of a limited number of warnings of each kind per minute.
 
-    Kinds are ours and not from received data, so that there are few.
+    Kinds are defined by this program, not by received data, so there are few.
     """
 
     def __init__(self, log: logging.Logger, most: int = 5) -> None:

@@ -1,8 +1,8 @@
 """Listing of the spools of all trucks, requested at once.
 
 Answers are read and decoded in a thread of their own, because a truck may list thousands of boots
-and answer a query any number of times. In each round only a few answers for a stream count, from
-trucks that share a name by mistake; bytes per vehicle are limited, and the queue is bounded.
+and answer a query any number of times. Several trucks may share a name by mistake: of their answers
+for one stream in a round a few count. Bytes per vehicle are limited, and the queue is bounded.
 """
 
 import logging

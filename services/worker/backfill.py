@@ -56,11 +56,11 @@ class WaitingCounts(NamedTuple):
     for_process: int = 0
     for_validation: int = 0
     for_data: int = 0
-    """Those of which samples are missing that may still arrive."""
+    """Number of crossings whose missing samples may still arrive."""
 
     @property
     def total(self) -> int:
-        """Number of all of them."""
+        """Number of all these crossings."""
         return sum(self)
 
 
@@ -82,7 +82,7 @@ class Backfill:
         settings: IdentificationSettings,
         ledger: Ledger,
         *,
-        reader: Callable[[], ProcessExecutor] = lambda: ProcessExecutor(1, prepare=_gently),
+        reader: Callable[[], ProcessExecutor] = lambda: ProcessExecutor(1, prepare=_lower_priority),
     ) -> None:
         self._source = source
         self._site = site
@@ -162,7 +162,7 @@ class Backfill:
         if not (self._recordings.groups or self._scanning or self._fetching or self._found):
             self.close()
 
-    # The process that reads
+    # The reading process.
 
     def _submit(self, task: BackgroundTask) -> None:
         if self._reader is None:
@@ -222,7 +222,7 @@ class Backfill:
             self._warned.add(warning)
             _log.warning("%s", warning)
 
-    # What is fetched
+    # The crossings to fetch.
 
     def _count(self, engine: Engine, want: _Request) -> list[_MissingStay]:
         """Count the waiting crossings and request validations; return those that may be fetched."""
@@ -343,6 +343,6 @@ def _near(entry_ns: int, exit_ns: int, stay: RecordedStay) -> bool:
     return are_one(entry_ns, max(exit_ns, entry_ns + 1), stay.entry_ns, stay.exit_ns)
 
 
-def _gently() -> None:
+def _lower_priority() -> None:
     """Lower the priority below that of identification and reception."""
     os.nice(_NICE)

@@ -66,7 +66,8 @@ class SiteReload(NamedTuple):
 class Loop:
     """Repetition of the steps until `stop`, and then until the present crossings are finished.
 
-    The next run could not receive them again. The rest takes at most `GONE_AFTER_S`.
+    Crossings of trucks that have left are finished, because the next run would not receive their
+    data. After the stop the loop waits at most `GONE_AFTER_S` for departing trucks.
     """
 
     def __init__(

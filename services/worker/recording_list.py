@@ -30,7 +30,7 @@ _RECENT_S: Final = 600.0
 A truck keeps five minutes of its messages for those that were away.
 """
 _GROWS_NS: Final = (1 << 63) - 1
-"""Time up to which a growing recording will have everything."""
+"""Time up to which a growing recording counts as recorded: it will have all that follows."""
 _QUIET_S: Final = 120.0
 """Time in s after a truck's last message from which missing data count as lost.
 
