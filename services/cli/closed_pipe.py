@@ -8,7 +8,7 @@ from typing import Any, TextIO, cast
 
 
 class OutlivingOutput:
-    """A stream that drops text once its pipe is closed; all else is the stream's own."""
+    """A stream that drops text once its pipe is closed, and is otherwise the given one."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream

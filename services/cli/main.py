@@ -30,7 +30,7 @@ from services.common.log_lines import configure_logging
 from services.common.outputs import declared
 from services.common.parquet_files import spare_pandas
 
-_OBJECTS_BETWEEN_LOOKS: Final = 20_000
+_OBJECTS_BETWEEN_SEARCHES: Final = 20_000
 _SERVICES: Final = ("logger", "worker", "truck", "gateway", "cluster")
 """Commands that run until they are stopped, and whose log is their only output."""
 _COUNTS_AT_EXIT: Final = ("_duckdb", "duckdb")
@@ -70,9 +70,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # No plugin inspects our models, and searching for plugins takes time.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    # Imports make a million objects that stay: to look for circles among them at every 700 takes
-    # 0.1 s of an identification.
-    gc.set_threshold(_OBJECTS_BETWEEN_LOOKS)
+    # Imports make a million objects that stay: a search for reference cycles among them after every
+    # 700 new ones takes 0.1 s of an identification.
+    gc.set_threshold(_OBJECTS_BETWEEN_SEARCHES)
     try:
         options = _parser().parse_args(arguments)
     except InputError as error:

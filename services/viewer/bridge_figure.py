@@ -73,7 +73,7 @@ _STEM = 0.05
 
 
 _FEWEST_DOTS = 2
-"""Number of crossings from which each has dots: one alone is the state."""
+"""Smallest number of crossings of which each has dots: a single one is the state itself."""
 
 
 class _Line(NamedTuple):

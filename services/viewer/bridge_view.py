@@ -100,7 +100,7 @@ def views_of_bridges(
 def describe_bridge(
     view: BridgeView, language: Language = ENGLISH, without: Collection[comparison.Stated] = ()
 ) -> list[str]:
-    """Return sentences on the result, as in the state's own finding; the caller has `without`."""
+    """Return sentences on the result, as in the state's own finding, except for `without`."""
     level = None if view.state is None else view.state.level
     return comparison.describe_comparison(
         view.comparison, view.unresolved, level, language, without

@@ -1,4 +1,4 @@
-"""The figure of all crossings of a bridge: EI by each of them, and the profiles they rolled on."""
+"""The figure of all crossings of a bridge: EI by each of them, and the road profiles."""
 
 from __future__ import annotations
 

@@ -53,8 +53,8 @@ def cut_height(
 ) -> float:
     """Return the height at which intervals of unresolved elements are cut; infinite if none is.
 
-    One that is much longer than all others, and than `highest`, would leave no height to them; so
-    would a marker at `farthest`. The `intervals` are means and limits, all (n,).
+    An interval that is much longer than all others, and than `highest`, would leave them no height;
+    so would a marker at `farthest`. The `intervals` are means and limits, all (n,).
     """
     for mean, low, high in intervals:
         is_resolved = high - low <= 2.0 * NORMAL_975 * RESOLVED * mean

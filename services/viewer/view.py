@@ -181,10 +181,10 @@ def viewer_arguments(shown: Path | str, *, web: bool, address: str = "127.0.0.1"
 
 
 def prepare_viewer(*, window: bool) -> None:
-    """Switch its statistics off.
+    """Switch the viewer's statistics off.
 
-    Raise FailureError if it is not installed, or needs a `window` and there is no screen: it would
-    print ten log lines of its own.
+    Raise FailureError if the viewer is not installed, or if there is no screen for a `window`: it
+    would print ten log lines of its own.
     """
     linux = sys.platform.startswith("linux")
     if window and linux and not any(os.environ.get(name) for name in _SCREENS):

@@ -1,4 +1,4 @@
-"""The command for certificates of the bus and of clusters: certs."""
+"""The command `driveby certs`: certificates of the bus and of clusters."""
 
 from typing import Final
 
