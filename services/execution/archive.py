@@ -329,8 +329,8 @@ def _identified(
     seen: set[str] = set()
     unsaved = _UnsavedResults(execution, store, job.header)
     try:
-        for number, work in enumerate(iter_tasks(job, problems), start=1):
-            content = task_hash(work, ours)
+        for number, task in enumerate(iter_tasks(job, problems), start=1):
+            content = task_hash(task, ours)
             if content in seen:
                 continue  # the same recording by two names
             seen.add(content)
@@ -338,7 +338,7 @@ def _identified(
             if result is not None:
                 yield _StoredCrossing(result, was_there=True)
                 continue
-            unsaved.submit(work._replace(number=number), content)
+            unsaved.submit(task._replace(number=number), content)
             yield from unsaved.done(0.0)
             while execution.is_full:
                 yield from unsaved.done(_WAIT_S)
@@ -362,16 +362,16 @@ class _UnsavedResults:
         self._unsaved: list[StoredResult] = []
         self._since_s = 0.0
 
-    def submit(self, work: IdentificationTask, content: str) -> None:
-        self._contents[work.number] = content
-        self._execution.submit(work)
+    def submit(self, task: IdentificationTask, content: str) -> None:
+        self._contents[task.number] = content
+        self._execution.submit(task)
 
     def done(self, timeout_s: float) -> Iterator[_StoredCrossing]:
         """Return the crossings whose results are on the disk by now."""
-        for work, result in self._execution.collect(timeout_s):
-            content = self._contents.pop(work.number)
-            if work.certificate is not None:
-                result = result.model_copy(update={"certificate": work.certificate})
+        for task, result in self._execution.collect(timeout_s):
+            content = self._contents.pop(task.number)
+            if task.certificate is not None:
+                result = result.model_copy(update={"certificate": task.certificate})
             if is_failed(result):
                 yield _StoredCrossing(result, was_there=False)
                 continue

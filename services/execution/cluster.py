@@ -55,7 +55,7 @@ again. Any other state belongs to a scheduler that is lost.
 
 class _Batch(NamedTuple):
     content: str
-    works: tuple[IdentificationTask, ...]
+    tasks: tuple[IdentificationTask, ...]
     tries: int = 0
     is_suspect: bool = False
     """Whether workers died while they had it, or another batch."""
@@ -126,16 +126,16 @@ class DaskExecutor:
     def waiting(self) -> int:
         """Number of crossings not yet submitted to the scheduler."""
         again = (*self._to_send, *self._suspects)
-        return len(self._pending) + sum(len(batch.works) for batch in again)
+        return len(self._pending) + sum(len(batch.tasks) for batch in again)
 
     @property
     def running(self) -> list[RunningCrossing]:
         """Always an empty list: only the workers know."""
         return []
 
-    def submit(self, work: IdentificationTask) -> None:
+    def submit(self, task: IdentificationTask) -> None:
         """Queue a crossing; it is submitted to the scheduler together with others."""
-        self._pending.append(work)
+        self._pending.append(task)
         self._send()
 
     def collect(self, timeout_s: float = 0.0) -> list[TaskResult]:
@@ -200,20 +200,20 @@ class DaskExecutor:
             if self._to_send:
                 self._submit(self._to_send.popleft())
             elif len(self._pending) >= size or (is_all and self._pending):
-                works = [self._pending.popleft() for _ in range(min(size, len(self._pending)))]
-                self._submit(self._batch_of(works))
+                tasks = [self._pending.popleft() for _ in range(min(size, len(self._pending)))]
+                self._submit(self._batch_of(tasks))
             else:
                 return
 
-    def _batch_of(self, works: Sequence[IdentificationTask]) -> _Batch:
-        content = combined_hash(task_hash(work, self._program) for work in works)
-        return _Batch(content, tuple(works))
+    def _batch_of(self, tasks: Sequence[IdentificationTask]) -> _Batch:
+        content = combined_hash(task_hash(task, self._program) for task in tasks)
+        return _Batch(content, tuple(tasks))
 
     def _submit(self, batch: _Batch) -> None:
         key = f"crossings-{batch.content}-{batch.tries}"
-        works = packed(map(_with_one_thread, batch.works))
+        tasks = packed(map(_with_one_thread, batch.tasks))
         self._submitted[batch.content] = _SubmittedBatch(
-            batch, self._scheduler.submit(key, works, self._program)
+            batch, self._scheduler.submit(key, tasks, self._program)
         )
 
     def _collect_all(self) -> None:
@@ -251,7 +251,7 @@ class DaskExecutor:
             self._failed(sent.batch, f"worker {answer.worker}: {answer.why}")
         else:
             results: tuple[CrossingResult, ...] = unpacked(answer)
-            self._finished += map(TaskResult, sent.batch.works, results)
+            self._finished += map(TaskResult, sent.batch.tasks, results)
         return True
 
     def _killed(self, batch: _Batch) -> None:
@@ -260,23 +260,23 @@ class DaskExecutor:
             return
         _log.warning(
             "workers died with a batch of %d crossings; retrying it alone",
-            len(batch.works),
+            len(batch.tasks),
         )
         self._suspects.append(batch._replace(tries=batch.tries + 1, is_suspect=True))
 
     def _failed(self, batch: _Batch, why: str) -> None:
         """Split a failed batch; reject a single crossing."""
-        works, line = batch.works, " ".join(why.split())[:200]
-        if len(works) > 1:
-            _log.warning("a batch of %d crossings: %s; retrying each alone", len(works), line)
-            singles = [self._batch_of([work]) for work in works]
+        tasks, line = batch.tasks, " ".join(why.split())[:200]
+        if len(tasks) > 1:
+            _log.warning("a batch of %d crossings: %s; retrying each alone", len(tasks), line)
+            singles = [self._batch_of([task]) for task in tasks]
             if batch.is_suspect:
                 self._suspects += (one._replace(is_suspect=True) for one in singles)
             else:
                 self._to_send += singles
             return
-        _log.error("identification of %s failed: %s", works[0].crossing_id, line)
-        self._finished.append(TaskResult(works[0], failed_result(works[0])))
+        _log.error("identification of %s failed: %s", tasks[0].crossing_id, line)
+        self._finished.append(TaskResult(tasks[0], failed_result(tasks[0])))
 
     def _forget(self, sent: _SubmittedBatch) -> None:
         del self._submitted[sent.batch.content]
@@ -316,8 +316,8 @@ class DaskExecutor:
         _log.warning("scheduler %s is back: submitted %s again", self._address, number)
 
 
-def _with_one_thread(work: IdentificationTask) -> IdentificationTask:
-    return work._replace(settings=work.settings.model_copy(update={"threads": 1}))
+def _with_one_thread(task: IdentificationTask) -> IdentificationTask:
+    return task._replace(settings=task.settings.model_copy(update={"threads": 1}))
 
 
 def _scheduler_with_workers(

@@ -91,24 +91,24 @@ class _Pools(threading.local):
 _POOLS = _Pools()
 
 
-def _results(works: Sequence[IdentificationTask]) -> list[CrossingResult]:
+def _results(tasks: Sequence[IdentificationTask]) -> list[CrossingResult]:
     """Return the results of crossings, in their order."""
     results: dict[int, CrossingResult] = {}
-    left = list(works)
+    left = list(tasks)
     pool = _POOLS.pool = _POOLS.pool or new_pool()
     try:
         pool.wait_until_warm()
         while left or pool.is_busy:
             while left and not pool.is_full:
                 pool.submit(left.pop(0))
-            for work, result in pool.collect(_WAIT_S):
-                results[work.number] = result
+            for task, result in pool.collect(_WAIT_S):
+                results[task.number] = result
     except BaseException:
         # Its running crossing is abandoned: the next batch gets another process.
         _POOLS.pool = None
         pool.close()
         raise
-    return [results[work.number] for work in works]
+    return [results[task.number] for task in tasks]
 
 
 def new_pool() -> ProcessExecutor:

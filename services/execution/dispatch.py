@@ -27,7 +27,7 @@ _POLL_S = 0.1
 class TaskResult(NamedTuple):
     """A crossing with its result."""
 
-    work: IdentificationTask
+    task: IdentificationTask
     result: CrossingResult
 
 
@@ -73,7 +73,7 @@ class CrossingExecutor(Protocol):
     def running(self) -> list[RunningCrossing]:
         """Running crossings in the order of their start."""
 
-    def submit(self, work: IdentificationTask) -> None:
+    def submit(self, task: IdentificationTask) -> None:
         """Submit a crossing; it is identified now, later or elsewhere."""
 
     def collect(self, timeout_s: float = 0.0) -> list[TaskResult]:
@@ -123,8 +123,8 @@ def collect(
     engine: Engine, execution: CrossingExecutor, timeout_s: float = 0.0
 ) -> Iterator[Output]:
     """Yield the engine's messages about the results and states that are available."""
-    for work, result in execution.collect(timeout_s):
-        yield from dispatch(engine, execution, engine.done(work, result))
+    for task, result in execution.collect(timeout_s):
+        yield from dispatch(engine, execution, engine.done(task, result))
     for fuse, state in execution.collect_fusions():
         yield from engine.fused(fuse, state)
 
@@ -135,10 +135,10 @@ def drain(engine: Engine, execution: CrossingExecutor) -> Iterator[Output]:
         yield from collect(engine, execution, _POLL_S)
 
 
-def failed_result(work: IdentificationTask) -> CrossingResult:
+def failed_result(task: IdentificationTask) -> CrossingResult:
     """Return the result of a crossing whose identification failed unexpectedly."""
-    data = work.data
+    data = task.data
     stay, way_m = data.stay, data.bridge.span_m + data.vehicle.length_m
     speed_m_per_s = way_m / (stay.exit_s - stay.entry_s) if stay.exit_s > stay.entry_s else 0.0
     passing = CrossingTimes(stay.entry_s, stay.exit_s, speed_m_per_s)
-    return rejected(data, work.settings, passing, [Reason.FAILED])
+    return rejected(data, task.settings, passing, [Reason.FAILED])

@@ -67,9 +67,9 @@ class InlineExecutor:
         """Always an empty list: no crossing runs between two calls."""
         return []
 
-    def submit(self, work: IdentificationTask) -> None:
+    def submit(self, task: IdentificationTask) -> None:
         """Identify the crossing. Raise what `identify` raises."""
-        self._finished.append(TaskResult(work, self._result(work)))
+        self._finished.append(TaskResult(task, self._result(task)))
 
     def collect(self, timeout_s: float = 0.0) -> list[TaskResult]:
         """Return the results since the last call."""
@@ -85,11 +85,11 @@ class InlineExecutor:
         fused, self._fused = self._fused, []
         return fused
 
-    def _result(self, work: IdentificationTask) -> CrossingResult:
+    def _result(self, task: IdentificationTask) -> CrossingResult:
         return self._identify(
-            work.data,
-            work.settings,
+            task.data,
+            task.settings,
             stopwatch=self._stopwatch,
-            report=partial(self._report, work.crossing_id),
+            report=partial(self._report, task.crossing_id),
             keep=self._keep,
         )

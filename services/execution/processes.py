@@ -179,12 +179,12 @@ class ProcessExecutor:
         ]
         return sorted(found, key=lambda one: -one.seconds)
 
-    def submit(self, work: IdentificationTask) -> None:
+    def submit(self, task: IdentificationTask) -> None:
         """Pass a crossing to a process, as soon as one is free."""
-        self._waiting.append(_Job(work))
+        self._waiting.append(_Job(task))
         self._fill()
         if self._waiting:
-            self._report(work.crossing_id, "waiting for a process", 0.0)
+            self._report(task.crossing_id, "waiting for a process", 0.0)
 
     def collect(self, timeout_s: float = 0.0) -> list[TaskResult]:
         """Return the crossings identified since the last call; see `CrossingExecutor`."""
@@ -440,8 +440,8 @@ def _end_with(lifeline: Connection) -> None:
         os._exit(1)
 
 
-def _identified(work: IdentificationTask) -> CrossingResult:
+def _identified(task: IdentificationTask) -> CrossingResult:
     (here,) = _HERE
-    here.submit(work)
+    here.submit(task)
     (finished,) = here.collect()
     return finished.result

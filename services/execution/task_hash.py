@@ -14,10 +14,10 @@ from schemas.settings import NOT_OF_THE_RESULT
 from services.identification.outputs import IdentificationTask
 
 
-def task_hash(work: IdentificationTask, program: Mapping[str, str]) -> str:
+def task_hash(task: IdentificationTask, program: Mapping[str, str]) -> str:
     """Return the hash of a crossing's data, its settings and the program."""
-    settings = work.settings.model_dump(mode="json", exclude=set(NOT_OF_THE_RESULT))
-    job = (*work.data, work.certificate, sorted(settings.items()), sorted(program.items()))
+    settings = task.settings.model_dump(mode="json", exclude=set(NOT_OF_THE_RESULT))
+    job = (*task.data, task.certificate, sorted(settings.items()), sorted(program.items()))
     return hashlib.sha256(b"".join(_parts(job))).hexdigest()[:32]
 
 

@@ -91,15 +91,15 @@ class BridgeStates:
 
     def begin(self, pending: PendingCrossing) -> None:
         """Record that a crossing is being identified."""
-        data = pending.work.data
+        data = pending.task.data
         self._at(data.realm, data.bridge.id).running.append(pending)
 
     def running_ids(self) -> set[str]:
         """Return the running crossings."""
-        return {one.work.crossing_id for b in self._of_bridge.values() for one in b.running}
+        return {one.task.crossing_id for b in self._of_bridge.values() for one in b.running}
 
     def done(
-        self, work: IdentificationTask, result: CrossingResult
+        self, task: IdentificationTask, result: CrossingResult
     ) -> Iterator[Output | FusionTask]:
         """Accept the result of a crossing, and yield the messages and fusions that follow.
 
@@ -107,21 +107,21 @@ class BridgeStates:
         arrives first: so nothing depends on the duration of an identification. Raise KeyError for a
         task that is not running.
         """
-        bridge = self._of_bridge[work.data.realm, work.data.bridge.id]
-        if all(one.work.number != work.number for one in bridge.running):
-            raise KeyError(f"{work.crossing_id} is not under way")
-        bridge.results[work.number] = result
-        while bridge.running and bridge.running[0].work.number in bridge.results:
+        bridge = self._of_bridge[task.data.realm, task.data.bridge.id]
+        if all(one.task.number != task.number for one in bridge.running):
+            raise KeyError(f"{task.crossing_id} is not running")
+        bridge.results[task.number] = result
+        while bridge.running and bridge.running[0].task.number in bridge.results:
             first = bridge.running.popleft()
-            yield from self._published(bridge, first, bridge.results.pop(first.work.number))
+            yield from self._published(bridge, first, bridge.results.pop(first.task.number))
 
     def _published(
         self, bridge: _OfBridge, found: PendingCrossing, result: CrossingResult
     ) -> Iterator[Output | FusionTask]:
-        realm, name = found.work.data.realm, found.work.data.bridge.id
+        realm, name = found.task.data.realm, found.task.data.bridge.id
         result = against(result, self._fusing.baselines.get(name))
-        if found.work.certificate is not None:
-            result = result.model_copy(update={"certificate": found.work.certificate})
+        if found.task.certificate is not None:
+            result = result.model_copy(update={"certificate": found.task.certificate})
         counts = usable(result)
         if counts is not None:
             bridge.counted = add_crossings(bridge.counted, [counts])

@@ -75,7 +75,7 @@ class Engine:
         self._finder = Finder(site, window_of(settings.method), self._names.recognise)
         self._waiting = WaitingCrossings(validations, has_room=has_room)
         self._states = BridgeStates(header, fusing, are_published=publishes_states)
-        self._works = 0
+        self._last_number = 0
         """Number of tasks up to now."""
 
     def resume(
@@ -184,15 +184,15 @@ class Engine:
         yield from self._waiting.keep(pending)
 
     def _work(self, one: Complete) -> IdentificationTask:
-        self._works += 1
-        return IdentificationTask(self._works, one.data, self._settings)
+        self._last_number += 1
+        return IdentificationTask(self._last_number, one.data, self._settings)
 
     def _begun(self, pending: PendingCrossing) -> Iterator[EngineOutput]:
         if pending.identifying is not None:
             yield pending.identifying
-        pending = pending._replace(work=self._waiting.certified(pending.work))
+        pending = pending._replace(task=self._waiting.certified(pending.task))
         self._states.begin(pending)
-        yield pending.work
+        yield pending.task
 
     def take(
         self, found: CrossingFromRecording, others: Iterable[str] = ()
@@ -201,8 +201,8 @@ class Engine:
 
         Messages of the trucks themselves give no second crossing from now on.
         """
-        work = found.pending.work
-        data, span_ns = work.data, (found.entry_ns, found.exit_ns)
+        task = found.pending.task
+        data, span_ns = task.data, (found.entry_ns, found.exit_ns)
         self._names.take(data, *span_ns)
         self._finder.settle(data.realm, data.vehicle.id, data.crossing_id)
         seen = self._finder.scene.traffic.others(
@@ -211,13 +211,13 @@ class Engine:
         against = data.against
         if names := sorted({*seen, *others}):
             _log.warning(
-                "%s: %s was on the bridge at the same time", work.crossing_id, ", ".join(names)
+                "%s: %s was on the bridge at the same time", task.crossing_id, ", ".join(names)
             )
             against = tuple(dict.fromkeys((*against, Reason.OTHER_TRUCK_ON_BRIDGE)))
-        self._works += 1
-        work = work._replace(number=self._works, data=data._replace(against=against))
+        self._last_number += 1
+        task = task._replace(number=self._last_number, data=data._replace(against=against))
         yield from found.messages
-        yield from self._begun(found.pending._replace(work=work))
+        yield from self._begun(found.pending._replace(task=task))
 
     def pending_ids(self) -> set[str]:
         """Return the crossings that are running or wait."""
@@ -255,10 +255,10 @@ class Engine:
             yield from self._begun(released)
 
     def done(
-        self, work: IdentificationTask, result: CrossingResult
+        self, task: IdentificationTask, result: CrossingResult
     ) -> Iterator[Output | FusionTask]:
         """Accept the result of a crossing; KeyError if it is not running (`BridgeStates.done`)."""
-        return self._states.done(work, result)
+        return self._states.done(task, result)
 
     def fused(self, fuse: FusionTask, state: BridgeResult | None) -> Iterator[Output]:
         """Accept the state of a bridge, None if the fusion failed (`BridgeStates.fused`)."""

@@ -36,7 +36,7 @@ NO_VALIDATIONS = Validations()
 class PendingCrossing(NamedTuple):
     """A complete crossing, with the messages about its identification."""
 
-    work: IdentificationTask
+    task: IdentificationTask
     identifying: Output | None
     """Message at the start of its identification; None if an earlier run has published it."""
     done: Output
@@ -45,11 +45,11 @@ class PendingCrossing(NamedTuple):
     @property
     def pair(self) -> VehicleBridgePair:
         """Truck and bridge."""
-        return VehicleBridgePair(self.work.data.vehicle.id, self.work.data.bridge.id)
+        return VehicleBridgePair(self.task.data.vehicle.id, self.task.data.bridge.id)
 
 
 def pending_of(
-    one: Complete, work: IdentificationTask, reported: Collection[pb.CrossingState]
+    one: Complete, task: IdentificationTask, reported: Collection[pb.CrossingState]
 ) -> PendingCrossing:
     """Return a crossing with its messages, less those that have been `reported`."""
     found = one.detection
@@ -58,7 +58,7 @@ def pending_of(
         return crossing_output(found, state, found.exit_ns)
 
     identifying = None if pb.IDENTIFYING in reported else output(pb.IDENTIFYING)
-    return PendingCrossing(work, identifying, output(pb.DONE))
+    return PendingCrossing(task, identifying, output(pb.DONE))
 
 
 class CrossingFromRecording(NamedTuple):
@@ -101,9 +101,9 @@ class WaitingCrossings:
         self._certificates = dict(certificates)
         self._wanted.clear()
         self._pending = deque(
-            one._replace(work=one.work._replace(data=data))
+            one._replace(task=one.task._replace(data=data))
             for one in self._pending
-            if (data := retargeted(one.work.data)) is not None
+            if (data := retargeted(one.task.data)) is not None
         )
         for pair in self.by_pair():
             if not self.is_certified(pair):
@@ -122,10 +122,10 @@ class WaitingCrossings:
         """Accept the hash of a pair's passed validation record."""
         self._certificates[pair] = certificate
 
-    def certified(self, work: IdentificationTask) -> IdentificationTask:
+    def certified(self, task: IdentificationTask) -> IdentificationTask:
         """Return a task with the validation record of its pair, where there is one."""
-        pair = VehicleBridgePair(work.data.vehicle.id, work.data.bridge.id)
-        return work._replace(certificate=self._certificates.get(pair))
+        pair = VehicleBridgePair(task.data.vehicle.id, task.data.bridge.id)
+        return task._replace(certificate=self._certificates.get(pair))
 
     def must_wait(self, pair: VehicleBridgePair) -> bool:
         """Return whether a crossing that is complete now has to wait."""
@@ -139,7 +139,7 @@ class WaitingCrossings:
             _log.warning(
                 "too many crossings wait; dropping %s: it is identified later from the logger's "
                 "recording, or by `driveby identify`",
-                self._pending.popleft().work.crossing_id,
+                self._pending.popleft().task.crossing_id,
             )
         if not self.is_certified(pending.pair) and pending.pair not in self._wanted:
             self._wanted.add(pending.pair)
@@ -149,7 +149,7 @@ class WaitingCrossings:
         """Return the ids of the crossings by pair, in the order of detection."""
         found: dict[VehicleBridgePair, list[str]] = {}
         for one in self._pending:
-            found.setdefault(one.pair, []).append(one.work.crossing_id)
+            found.setdefault(one.pair, []).append(one.task.crossing_id)
         return found
 
     def pairs(self) -> list[VehicleBridgePair]:

@@ -178,7 +178,7 @@ def fetch_crossings(
     for stay in wanted:
         near = [m for m in messages.values() if _is_wanted(m, [stay])]
         one = _decided(near, stay, known, site, settings)
-        if one is not None and (is_final or _is_whole(one.pending.work, near)):
+        if one is not None and (is_final or _is_whole(one.pending.task, near)):
             found.append((stay, one))
         else:
             missing.append(stay)
@@ -259,15 +259,15 @@ def _moment(message: Message) -> tuple[int, int]:
         return -1, message.sequence
 
 
-def _is_whole(work: IdentificationTask, messages: list[Message]) -> bool:
+def _is_whole(task: IdentificationTask, messages: list[Message]) -> bool:
     """Return whether all messages of a crossing are present."""
-    data = work.data
+    data = task.data
     if data.stay.passage in (Passage.BEGINS_ON_BRIDGE, Passage.ENDS_ON_BRIDGE):
         return False
     fixes = sorted(m.sequence for m in messages if m.key.stream == "gnss")
     if data.samples is None or fixes[-1] - fixes[0] != len(fixes) - 1:
         return False
-    begin_s, end_s = window_of(work.settings.method)(data.stay, data.bridge, data.vehicle)
+    begin_s, end_s = window_of(task.settings.method)(data.stay, data.bridge, data.vehicle)
     step_s = 2.0 / data.samples.rate_hz
     channels = data.samples.channels.values()
     covered_s = max((values.size for values in channels), default=0) / data.samples.rate_hz

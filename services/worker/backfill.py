@@ -313,7 +313,7 @@ class Backfill:
 
     def _others(self, found: CrossingFromRecording) -> Iterable[str]:
         """Return the other trucks on the bridge, as their recordings show."""
-        data = found.pending.work.data
+        data = found.pending.task.data
         return {
             vehicle
             for vehicle, known in self._stays.items()

@@ -94,7 +94,7 @@ def all_of(on: DaskExecutor) -> list[TaskResult]:
 
 
 def is_each_once(found: list[TaskResult], given: list[IdentificationTask]) -> bool:
-    return sorted(one.work.number for one in found) == sorted(work.number for work in given)
+    return sorted(one.task.number for one in found) == sorted(work.number for work in given)
 
 
 def test_a_result_that_goes_with_its_worker_is_waited_for(
@@ -136,7 +136,7 @@ def test_an_answer_that_does_not_come_keeps_no_other_one_up(clients: list[Client
         assert on.collect() == []
         assert (late.asked, other.asked) == (1, 0)  # and the scheduler is looked after
         (one,) = on.collect()
-        assert one.work.number == given[1].number
+        assert one.task.number == given[1].number
         late.given = there
         assert is_each_once([one, *all_of(on)], given)
 

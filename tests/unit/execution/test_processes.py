@@ -221,7 +221,7 @@ def test_an_error_in_a_process_is_a_verdict(caplog: pytest.LogCaptureFixture) ->
     with ProcessExecutor(1, identify=broken, prepare=nothing) as processes:
         processes.submit(work)
         (finished,) = all_of(processes)
-    assert finished.work.number == work.number
+    assert finished.task.number == work.number
     assert finished.result.reasons == ("failed",)
     assert "singular" in caplog.text
 

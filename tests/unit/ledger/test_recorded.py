@@ -104,8 +104,8 @@ def test_what_is_found_is_what_a_worker_finds_that_listens(
     assert found.missing == ()
     assert [stay for stay, _ in found.found] == stays
     for (_, one), work in zip(found.found, live(), strict=True):
-        assert one.pending.work.crossing_id == work.crossing_id
-        same_data(one.pending.work, work)
+        assert one.pending.task.crossing_id == work.crossing_id
+        same_data(one.pending.task, work)
         published = [pb.Crossing.FromString(o.payload).state for o in one.messages]
         assert published == [pb.DETECTED, pb.COMPLETE]
     payloads = [o.payload for _, one in found.found for o in one.messages]
