@@ -23,7 +23,7 @@ EXTRAS: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 def check_extras(what: str, extras: Iterable[str]) -> None:
-    """InputError that explains how to install them if a module of these extras is missing."""
+    """Raise InputError with the install command if a module of these extras is missing."""
     lacking = {extra: _missing(EXTRAS[extra]) for extra in extras}
     lacking = {extra: modules for extra, modules in lacking.items() if modules}
     if lacking:

@@ -154,7 +154,7 @@ class DaskExecutor:
         return finished
 
     def submit_fusion(self, fuse: FusionTask) -> None:
-        """Fuse the crossings inline. Raise what `estimate_bridge_state` raises."""
+        """Fuse the crossings inline. Raise what `state_of` raises."""
         self._inline.submit_fusion(fuse)
 
     def collect_fusions(self) -> list[FusionResult]:

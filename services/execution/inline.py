@@ -77,7 +77,7 @@ class InlineExecutor:
         return finished
 
     def submit_fusion(self, fuse: FusionTask) -> None:
-        """Fuse the crossings. Raise what `estimate_bridge_state` raises."""
+        """Fuse the crossings. Raise what `state_of` raises."""
         self._fused.append(FusionResult(fuse, state_of(fuse.counted, fuse.bridge, fuse.fusing)))
 
     def collect_fusions(self) -> list[FusionResult]:

@@ -1,7 +1,7 @@
 """Identification and fusion in processes of their own, so that the caller can listen meanwhile.
 
 Every process is warm (its kernels are loaded before its first crossing) and works on one crossing
-at a time. If it dies, for want of memory or in a library, its crossing is tried once more in a new
+at a time. If it dies, for lack of memory or in a library, its crossing is tried once more in a new
 process and then rejected as `failed`: no crossing can end the caller, nor another crossing. A hung
 process (`hang_watchdog`), at its work or during its start, is killed, so it dies as well.
 
@@ -70,7 +70,7 @@ class BackgroundResult(NamedTuple):
 
 
 StateOf = Callable[[RecentCrossings, str, FusionSettings], BridgeResult | None]
-"""Type of `estimate_bridge_state`."""
+"""Type of `bridge_state.state_of`."""
 _Task = IdentificationTask | FusionTask | BackgroundTask
 _BridgeName = tuple[str, str]
 """Realm and bridge."""

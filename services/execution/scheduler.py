@@ -45,7 +45,7 @@ class UnsentFuture(NamedTuple):
     """State in Dask's terms, as of all batches of a lost scheduler."""
 
     def release(self) -> None:
-        """Do nothing: nobody holds it."""
+        """Do nothing: no scheduler holds the result."""
 
 
 class Scheduler:
@@ -87,7 +87,10 @@ class Scheduler:
             _log.debug("cannot retire worker %s: %s", worker, error)
 
     def wait_for_workers(self, longest_s: float) -> None:
-        """Wait for workers; FailureError without any, AwayError if the scheduler is lost."""
+        """Wait for workers.
+
+        Raise FailureError without any, SchedulerUnavailableError if the scheduler is lost.
+        """
         deadline = time.monotonic() + longest_s
         is_logged = False
         while not (threads := self.threads):
@@ -109,8 +112,8 @@ class Scheduler:
     def check_workers(self, program: dict[str, str]) -> None:
         """Raise FailureError with the names of the workers of another program, if there are any.
 
-        Raise AwayError if they do not answer. Versions are requested first, which executes nothing
-        that is sent: a pickle of one Python version may end a process of another.
+        Raise SchedulerUnavailableError if they do not answer. Versions are requested first, which
+        executes nothing that is sent: a pickle of one Python version may end a process of another.
         """
         packages = [name for name in program if name != PYTHON]
         versions = self._asked(

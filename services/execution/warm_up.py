@@ -4,7 +4,7 @@ numba stores the compiled form next to the sources, for every later start of any
 a change of a kernel's own file, but not of another kernel that it has inlined: so everything is
 compiled again when any source is newer than its compiled form.
 
-`make install` ends with this. An installation must not fail for want of a cache (a read-only
+`make install` ends with this. An installation must not fail for lack of a cache (a read-only
 folder, a processor that the compiler does not know): the first command then compiles for itself.
 The image of the containers is built with `--strict`.
 """

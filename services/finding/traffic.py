@@ -79,7 +79,7 @@ class Traffic:
         time_s = np.array([(t - entry_ns) * 1e-9 for t in times_ns])
         length_s = (exit_ns - entry_ns) * 1e-9
         columns = np.vstack([time_s, np.array([near[t] for t in times_ns]).T])
-        # After so long a silence it is another visit.
+        # A longer silence separates two visits.
         away = np.flatnonzero(np.diff(time_s) > LONGEST_UNSEEN_S) + 1
         return any(
             stay.entry_s < length_s and stay.exit_s > 0.0

@@ -175,7 +175,7 @@ def run_trial(trial: ValidationTrial, pool: ProcessPoolExecutor, processes: int)
                 trial.add(number, future.result())
             except BrokenExecutor as error:
                 raise FailureError(
-                    f"{trial.pair}: a process that simulated a crossing died, perhaps for want of "
+                    f"{trial.pair}: a process that simulated a crossing died, perhaps for lack of "
                     "memory"
                 ) from error
             except Exception:  # any error counts against the method and does not end the trial

@@ -15,7 +15,7 @@ message is appended to the spool and queued, and a thread publishes it. If the q
 because the router accepts nothing, the message stays in the spool, and the logger requests it
 (`schemas.spool`) once it notices the gap. Messages that a logger has confirmed are freed. Without a
 router at the start a thread tries until there is one. Without a spool, messages are published at
-once, and those that nobody has fetched are lost with this process.
+once, and those that no subscriber has fetched are lost with this process.
 """
 
 import contextlib
@@ -81,7 +81,7 @@ _FIRST_ANSWER_S = 1.0
 _KEPT = "the spool keeps the messages"
 _MEANWHILE = "all messages go to the spool meanwhile"
 Connect = Callable[[], zenoh.Session]
-"""Open a session; raise FailureError if there is no answer now."""
+"""Function that opens a session, or raises FailureError if there is no answer now."""
 
 
 class Gateway:
