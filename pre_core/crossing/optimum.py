@@ -199,7 +199,7 @@ def _about_truck(
         return None, 0
     report("trying other bridges", 0.55)
     left = min(_MAX_ABOUT_TRUCK, max_evaluations - _evaluations_of_all(found))
-    other, used = about_truck(first, alone.y, _WITHOUT_MISMATCH[0], left)
+    other, used = about_truck(first, alone.y, _WITHOUT_MISMATCH[0], left, chi2)
     return (None if other is None or other.chi2_per_dof >= chi2 else other), used
 
 

@@ -401,6 +401,11 @@ def test_without_a_fit_the_best_poor_start_is_completed(
         # Fits that are not worth completing, and one that is hopeless.
         ((61.0, 70.0, 20.0, 30.0, 40.0, 50.0), None, 6),
         ((101.0,), None, 1),
+        # A second start leads to the misfit that earlier fits reached, 9.
+        ((11.0, 8.9), 8.9, 2),
+        ((11.0, 8.7, 1.0, 3.0, 3.0, 3.0, 3.0), 1.0, 5),
+        # Not where another start leads to less.
+        ((4.0, 9.0, 1.0, 3.0, 3.0, 3.0, 3.0), 1.0, 5),
     ],
 )
 def test_other_bridges_about_a_truck_are_tried_as_long_as_they_fit_better(
@@ -409,7 +414,7 @@ def test_other_bridges_about_a_truck_are_tried_as_long_as_they_fit_better(
     fits = iter(chi2)
     about = tried_bridges(fits, monkeypatch)
     first = found(5.0, 1)._replace(state=SimpleNamespace(y=np.zeros(1), _replace=moved))
-    other, used = refinement.about_truck(first, np.full(1, 7.0), STRATEGY, 1000)
+    other, used = refinement.about_truck(first, np.full(1, 7.0), STRATEGY, 1000, 9.0)
     assert (other.chi2_per_dof if other else None) == best
     offsets = [(7.0, True), (5.8, True), (8.2, True), (7.0, False), (5.8, False), (8.2, False)]
     scanned = [one for one in about if one[0] > 1.0]
@@ -425,7 +430,7 @@ def test_other_bridges_about_a_truck_are_tried_as_long_as_they_fit_better(
 def test_bridges_are_tried_until_all_evaluations_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
     about = tried_bridges(iter((6.0, 5.0)), monkeypatch)
     first = found(5.0, 1)._replace(state=SimpleNamespace(y=np.zeros(1), _replace=moved))
-    other, used = refinement.about_truck(first, np.full(1, 7.0), STRATEGY, 21)
+    other, used = refinement.about_truck(first, np.full(1, 7.0), STRATEGY, 21, 9.0)
     assert other is not None
     assert (other.chi2_per_dof, used, len(about)) == (5.0, 22, 2)
 
@@ -464,7 +469,7 @@ def test_bridge_whose_fit_took_all_steps_is_fitted_on(monkeypatch: pytest.Monkey
     monkeypatch.setattr(refinement, "other_bridges", lambda *_, **__: (next(sets), 10))
     monkeypatch.setattr(refinement, "fit_all", lambda *_: (found(1.0, 1, next(ends)), 1))
     first = found(5.0, 1)._replace(state=SimpleNamespace(y=np.zeros(1), _replace=moved))
-    other, used = refinement.about_truck(first, np.zeros(1), STRATEGY, 1000)
+    other, used = refinement.about_truck(first, np.zeros(1), STRATEGY, 1000, 9.0)
     assert other is not None
     assert other.ending is Termination.CONVERGED
     assert used == 32
