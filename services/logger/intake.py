@@ -75,6 +75,10 @@ class Intake:
     _refused_reported_s: dict[str, float] = field(default_factory=dict)
     _late: Counter[tuple[Key, int]] = field(default_factory=Counter)
     _lost: dict[tuple[Key, int], Intervals] = field(default_factory=dict)
+    """Lost messages to report."""
+    _given_up: dict[tuple[Key, int], Intervals] = field(default_factory=dict)
+    """Lost messages, which may arrive all the same: a truck with a full disk holds only those that
+    are on their way."""
     _holes: dict[tuple[Key, int], dict[tuple[int, int], float]] = field(default_factory=dict)
     _reported: dict[tuple[Key, int], Intervals] = field(default_factory=dict)
 
@@ -146,7 +150,8 @@ class Intake:
         seen = self.seen.numbers(where, boot_id)
         for a, b in seen.missing_of([(first, last)]):
             self.counts["lost"] += seen.add_range(a, b)
-            self._lost.setdefault((where, boot_id), Intervals()).add_range(a, b)
+            for memory in (self._lost, self._given_up):
+                memory.setdefault((where, boot_id), Intervals()).add_range(a, b)
             self.settled.append((where, boot_id, a, b))
 
     def report(
@@ -184,7 +189,7 @@ class Intake:
 
     def _forget(self, where: Key, boot_id: int) -> None:
         name = (where, boot_id)
-        for memory in (self.seen.streams, self._holes, self._reported):
+        for memory in (self.seen.streams, self._holes, self._reported, self._given_up):
             memory.pop(name, None)
         self.forgotten.append(name)
         self._clocks.forget(where, boot_id)
@@ -203,7 +208,9 @@ class Intake:
                 raise ValueError(
                     f"{where.stream}: sequence {sequence} received again with other content"
                 )
-            return False
+            given_up = self._given_up.get(name)
+            if given_up is None or not given_up.remove_range(sequence, sequence):
+                return False
         stream.recent[identity] = crc
         if len(stream.recent) > _RECENT:
             del stream.recent[next(iter(stream.recent))]

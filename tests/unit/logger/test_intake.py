@@ -380,6 +380,19 @@ def test_lost_messages_are_reported_and_no_longer_a_gap() -> None:
     assert intake.report(*at(21.0)) == []
 
 
+def test_message_that_arrives_after_it_was_given_up_is_written_once() -> None:
+    """A truck with a full disk holds no message that it has just sent."""
+    intake = make()
+    assert intake.accept(message(0), NOW_NS)
+    intake.mark_lost(GNSS, 1, 1, 2, NOW_NS)
+    assert intake.accept(message(2), NOW_NS)
+    assert intake.accept(message(2), NOW_NS) is None
+    assert intake.counts["duplicates"] == 1
+    # Given up again after it was written, as by a truck that does not list it.
+    intake.mark_lost(GNSS, 1, 2, 2, NOW_NS)
+    assert intake.accept(message(2), NOW_NS) is None
+
+
 def test_a_bad_message_from_a_spool_is_not_asked_for_for_ever() -> None:
     intake = make()
     intake.accept(message(0), NOW_NS)
