@@ -58,6 +58,7 @@ from services.bus.participants import SubscriberCheck
 from services.bus.publisher import Publisher
 from services.common.errors import FailureError
 from services.common.log_lines import about
+from services.common.naming import count_of
 from services.truck.spool import Spool
 
 __all__ = ["Gateway"]
@@ -110,7 +111,7 @@ class Gateway:
         self.deferred = 0
         """Messages that were spooled and not published, because the bus did not take them."""
         self.unspooled = 0
-        """Messages that the disk did not take; they were published all the same."""
+        """Messages that the disk did not take; they are published once there is a router."""
         self.is_online = False
         """Whether there is a session; once there is one, it connects again by itself."""
         self._next: Counter[str] = Counter()
@@ -290,8 +291,8 @@ class Gateway:
             if time.monotonic() >= self._complained_s + _COMPLAINT_PERIOD_S:
                 self._complained_s = time.monotonic()
                 self.log.error(
-                    "%s: spool: %s; %d messages were published without being on disk",
-                    self.vehicle, error.strerror, self.unspooled,
+                    "%s: spool: %s; %s in memory only, until a router takes them",
+                    self.vehicle, error.strerror, count_of(self.unspooled, "message"),
                 )  # fmt: skip
             return False
 

@@ -40,7 +40,7 @@ from services.bus.playback import (
     stopped_by_signals,
 )
 from services.bus.session import checked_realm, open_session
-from services.common.errors import InputError
+from services.common.errors import FailureError, InputError
 from services.common.naming import count_of
 from services.recordings.recording import check_message, read_messages
 from services.truck.gateway import Connect, Gateway
@@ -72,7 +72,7 @@ def run(asked: TruckSettings, *, connect_timeout_s: float | None = CONNECT_TIMEO
     Raise InputError if the recording is missing, invalid or without that vehicle, or the spool is
     another truck's; FailureError if the endpoint does not answer within `connect_timeout_s` (None:
     wait for ever; irrelevant with a spool), nothing subscribes until the end (a spool keeps the
-    messages), or the logger did not confirm everything.
+    messages), the logger did not confirm everything, or messages are neither spooled nor sent.
     """
     check_speed(asked.speed)
     realm = checked_realm(asked.realm)
@@ -102,19 +102,24 @@ def run(asked: TruckSettings, *, connect_timeout_s: float | None = CONNECT_TIMEO
             gateway.warn_without_subscriber()
         sent = _publish(gateway, messages, asked, stop)
         confirm(gateway.delivery, sent, gateway.subscriber_complaint)
-        if gateway.is_online:
-            gateway.log.info(
-                "%s of %s published in realm %s",
-                count_of(sent, "message"),
-                gateway.vehicle,
-                realm,
-            )
-        else:
-            gateway.log.warning(
-                "%s of %s kept in the spool and none published, as no router answered at %s",
-                count_of(sent, "message"), gateway.vehicle, asked.address,
-            )  # fmt: skip
+        _report_end(gateway, sent, asked.address)
     return 0
+
+
+def _report_end(gateway: Gateway, sent: int, address: str) -> None:
+    """Log where the messages are; raise FailureError if some are neither on the disk nor sent."""
+    number = f"{count_of(sent, 'message')} of {gateway.vehicle}"
+    if gateway.is_online:
+        gateway.log.info("%s published in realm %s", number, gateway.publisher.realm)
+        return
+    if gateway.unspooled:
+        raise FailureError(
+            f"{gateway.unspooled} of {number} are lost: no room in the spool, and no router "
+            f"answered at {address}; the spool keeps the others"
+        )
+    gateway.log.warning(
+        "%s kept in the spool and none published, as no router answered at %s", number, address
+    )
 
 
 def _publish(

@@ -1,5 +1,6 @@
 """When a recording with pauses is published: what is waited for, what is said, what is stamped."""
 
+import errno
 import logging
 import re
 import time
@@ -14,6 +15,8 @@ from services.bus import playback
 from services.cli import main as cli
 from services.logger.health_line import health_line
 from services.truck.run import _driven_now, _log_timing, _times
+from services.truck.spool import Spool
+from tests.drives import SAMPLE
 from tests.unit.bus.test_playback import Clock, Delivered
 from tests.unit.identification.test_engine_resume import THERE, engine, fed, messages_of
 
@@ -126,6 +129,27 @@ def test_long_lag_is_explained_where_it_is_reported() -> None:
         "lag 1356.00 s (old samples: replayed faster than real time, sent late, or a clock is "
         "wrong), queue 0" in health_line({"lag_s": 1356.0})
     )
+
+
+def test_messages_on_no_disk_and_with_no_router_are_reported_as_lost(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    endpoint: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    append = Spool.append
+
+    def full(self: Spool, stream: str, sequence: int, payload: bytes) -> None:
+        if stream == "gnss":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        append(self, stream, sequence, payload)
+
+    monkeypatch.setattr(Spool, "append", full)
+    monkeypatch.setattr("services.bus.delivery.LINGER_S", 0.0)
+    arguments = ["--spool", str(tmp_path / "spool"), "--endpoint", endpoint, "--speed", "50"]
+    assert cli.main(["truck", str(SAMPLE), *arguments]) == 1
+    [line] = [one for one in capsys.readouterr().err.splitlines() if one.startswith("driveby: ")]
+    assert "90 of 360 messages of truck-1 are lost: no room in the spool" in line
 
 
 def test_the_option_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
