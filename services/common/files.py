@@ -260,6 +260,21 @@ def make_folder(folder: Path) -> None:
     check_folder_writable(folder)
 
 
+def check_readable_below(folder: Path) -> None:
+    """Raise InputError for a folder in `folder` that cannot be listed.
+
+    A search leaves it out silently, and its files would count as absent. Hidden folders and the
+    lost+found of a file system hold no data.
+    """
+
+    def refuse(error: OSError) -> None:
+        if not isinstance(error, FileNotFoundError | NotADirectoryError):
+            raise InputError(f"{error.filename}: cannot be read: {_reason(error)}") from None
+
+    for _, below, _ in os.walk(folder, onerror=refuse):
+        below[:] = [name for name in below if name[0] != "." and name != "lost+found"]
+
+
 def check_ordinary(path: Path) -> None:
     """Raise InputError if `path` is neither a file nor a folder.
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple
 
 from services.common.errors import FailureError, InputError
 from services.common.extras import check_installed, install_command
-from services.common.files import make_folder, write_atomically
+from services.common.files import check_readable_below, make_folder, write_atomically
 
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
@@ -103,6 +103,8 @@ def files_below(folder: Folder, suffix: str, below: str = "") -> list[Entry]:
         top = folder.path(below)
         # An object store may cache an older listing.
         folder.files.invalidate_cache(top)
+        if folder.is_local:
+            check_readable_below(Path(top))
         try:
             found = folder.files.find(top, detail=True)
         except FileNotFoundError:

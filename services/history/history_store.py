@@ -25,7 +25,7 @@ from schemas.fusion import FusionLikelihood
 from schemas.results import CrossingResult, ElementState, ResultHeader, Results
 from schemas.topics import check_identifier, check_realm
 from services.common.errors import InputError
-from services.common.files import make_folder, write_atomically
+from services.common.files import check_readable_below, make_folder, write_atomically
 from services.common.naming import first_of
 from services.common.parquet_files import FILES, arrow, decoded, encoded
 from services.history.add_summary import AddSummary, CrossingKey
@@ -143,6 +143,7 @@ def bridges_of(folder: Path) -> dict[tuple[str, str], Path]:
     """Return all bridges of a history by realm and name; InputError without such a folder."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; driveby history add RESULTS creates a history")
+    check_readable_below(folder)
     found = {}
     for path in sorted((folder / CROSSINGS).glob("realm=*/bridge=*")):
         realm = path.parent.name.removeprefix("realm=")

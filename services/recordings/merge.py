@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from schemas.topics import Message, topic
 from services.common.errors import InputError
+from services.common.files import check_readable_below
 from services.common.intervals import Intervals
 from services.recordings.recording import read_messages
 
@@ -27,6 +28,7 @@ def recordings_in(paths: Iterable[Path]) -> list[Path]:
         if not path.is_dir():
             found.append(path)
             continue
+        check_readable_below(path)
         below = sorted(p for p in path.rglob("*.mcap") if p.is_file() and p.name[0] != ".")
         if not below:
             raise InputError(f"{path}: holds no recording (.mcap)")

@@ -3,6 +3,7 @@
 import errno
 import os
 import re
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,9 @@ from services.common.files import (
     replaced_atomically,
     write_atomically,
 )
+from services.common.stores import files_below, folder_at
+from services.history.history_store import bridges_of
+from services.recordings.merge import recordings_in
 
 
 def _half(path: Path, error: Exception) -> None:
@@ -141,3 +145,34 @@ def test_a_lock_of_another_user_is_taken_all_the_same(
     with pytest.raises(InputError, match="somebody is here"):
         lock_folder(tmp_path, "lock", "somebody is here")
     os.close(first)
+
+
+@pytest.mark.parametrize(
+    "search",
+    [
+        lambda folder: recordings_in([folder]),
+        lambda folder: files_below(folder_at(str(folder)), ".mcap"),
+        bridges_of,
+    ],
+    ids=["recordings", "catalogue", "history"],
+)
+def test_search_names_a_folder_that_cannot_be_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, search: Callable[[Path], Iterable[object]]
+) -> None:
+    """A search that left it out would count its recordings and alarms as absent."""
+    for name in ("a.mcap", "closed/b.mcap", "lost+found/c.mcap", ".hidden/d.mcap"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    closed = {"lost+found", ".hidden"}
+    scandir = os.scandir
+
+    def refused(where: str = ".") -> object:
+        if Path(where).name in closed:
+            raise PermissionError(errno.EACCES, "Permission denied", str(where))
+        return scandir(where)
+
+    monkeypatch.setattr("os.scandir", refused)
+    search(tmp_path)
+    closed.add("closed")
+    with pytest.raises(InputError, match=r"/closed: cannot be read: Permission denied$"):
+        search(tmp_path)
