@@ -26,6 +26,9 @@ _VERDICTS: Final = {
     26: "its certificate is not that of a router or logger",
 }
 """Verdicts on a router's certificate by OpenSSL's codes (X509_V_ERR_…)."""
+_SILENT: Final = (
+    "the one there does not answer the TLS handshake; was it started without --tls FOLDER?"
+)
 _REFUSALS: Final = {
     "UNKNOWN_CA": "of another authority than its own",
     "CERTIFICATE_EXPIRED": "expired",
@@ -66,14 +69,16 @@ def _without_credentials(link: socket.socket) -> str | None:
 
 def _handshake(link: socket.socket, host: str, tls: Path) -> str | None:
     address = link.getpeername()
+    is_tls = False
     try:
         with _context(tls).wrap_socket(link, server_hostname=host) as secured:
+            is_tls = True
             secured.settimeout(_VERDICT_S)
             secured.recv(1)
     except ssl.SSLCertVerificationError as error:
         return _verdict(error.verify_code, host, address, tls)
     except TimeoutError:
-        return None
+        return None if is_tls else _SILENT
     except ssl.SSLError as error:
         refusals = [text for name, text in _REFUSALS.items() if name in (error.reason or "")]
         return f"it refuses {tls / CERTIFICATE} as {refusals[0]}" if refusals else None

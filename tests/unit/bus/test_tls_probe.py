@@ -99,6 +99,14 @@ def test_router_that_requires_credentials_is_named(credentials: Path, tls_endpoi
     assert cause == "the one there requires --tls FOLDER (and tls/ in the endpoint)"
 
 
+def test_router_without_credentials_is_named(credentials: Path, tls_endpoint: str) -> None:
+    with router(tls_endpoint.replace("tls/", "tcp/"), None):
+        cause = cause_of_failure(tls_endpoint, credentials / "truck-1")
+    assert cause == (
+        "the one there does not answer the TLS handshake; was it started without --tls FOLDER?"
+    )
+
+
 def test_unknown_host_is_named(credentials: Path) -> None:
     where = "tls/no-such-host.invalid:7447"
     cause = "the host no-such-host.invalid is unknown"
