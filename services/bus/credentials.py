@@ -12,6 +12,8 @@ No key is ever written to a message or a log.
 """
 
 import logging
+import threading
+import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,7 +44,13 @@ AUTHORITY, CERTIFICATE, KEY, CONFIGURATION = "ca.pem", "cert.pem", "key.pem", "z
 
 _log = logging.getLogger(__name__)
 _WARN_BEFORE = timedelta(days=30)
+_WARN_AGAIN = timedelta(days=1)
+_LOOK_S = 3600.0
+"""Longest sleep between two looks at the clock, which does not run while a machine is suspended."""
 _CLOCK_TOLERANCE = timedelta(minutes=5)
+_warned: dict[tuple[Path, datetime], datetime] = {}
+"""Time of the last warning by file and expiry: a service without a router checks every second."""
+_watched: set[tuple[Path, datetime]] = set()
 
 
 class Subject(NamedTuple):
@@ -99,9 +107,47 @@ def check_credentials(folder: Path, now: datetime | None = None) -> Subject:
         if now < one.not_valid_before_utc - _CLOCK_TOLERANCE:
             day = one.not_valid_before_utc.date()
             raise InputError(f"{path}: valid from {day} only; is this machine's clock right?")
-        if now > one.not_valid_after_utc - _WARN_BEFORE:
-            _log.warning("%s expires on %s", path, one.not_valid_after_utc.date())
+        _warn_of_expiry(path, one.not_valid_after_utc, now)
     return subject
+
+
+def watch_expiry(folder: Path) -> None:
+    """Log, while this process runs, that the credentials of a session expire or have expired.
+
+    A service runs for months, and afterwards every connection ends without a cause.
+    """
+    paths = folder.absolute() / CERTIFICATE, folder.absolute() / AUTHORITY
+    expires, path = min((read_certificate(path).not_valid_after_utc, path) for path in paths)
+    if (path, expires) not in _watched:
+        _watched.add((path, expires))
+        arguments = (path, expires)
+        threading.Thread(target=_log_expiry, args=arguments, name="expiry", daemon=True).start()
+
+
+def _log_expiry(path: Path, expires: datetime) -> None:
+    while True:
+        now = datetime.now(UTC)
+        _warn_of_expiry(path, expires, now)
+        left_s = (expires - now).total_seconds()
+        time.sleep(min(left_s + 0.1, _LOOK_S) if left_s > 0.0 else _LOOK_S)
+
+
+def _warn_of_expiry(path: Path, expires: datetime, now: datetime) -> None:
+    """Warn of a certificate that expires soon, once a day, and at once when it has expired."""
+    name = (path.absolute(), expires)
+    last = _warned.get(name)
+    is_new = last is None or now > last + _WARN_AGAIN or last <= expires < now
+    if now <= expires - _WARN_BEFORE or not is_new:
+        return
+    _warned[name] = now
+    if now <= expires:
+        _log.warning("%s expires on %s", path, expires.date())
+    else:
+        _log.error(
+            "%s expired on %s, so every connection ends; renew it with `driveby certs --renew` "
+            "and restart",
+            path, expires.date(),
+        )  # fmt: skip
 
 
 def check_speaks_for(folder: Path | None, role: str, name: str | None = None) -> None:

@@ -38,6 +38,7 @@ from services.bus.credentials import (
     LISTENERS,
     check_credentials,
     link_settings,
+    watch_expiry,
 )
 from services.bus.tls_probe import cause_of_failure
 from services.common.endpoints import default_endpoint
@@ -111,7 +112,7 @@ def open_session(
     config = _configuration(endpoint, tls, is_client=connect is not None)
     while True:
         try:
-            return zenoh.open(config)
+            session = zenoh.open(config)
         except zenoh.ZError as error:
             _log.debug("zenoh: %s", error)
             if listen is not None:
@@ -120,6 +121,10 @@ def open_session(
             if time.monotonic() >= deadline:
                 raise FailureError(_why_not_connected(endpoint, timeout_s, tls)) from None
             time.sleep(_PAUSE_S)
+        else:
+            if tls is not None:
+                watch_expiry(tls)
+            return session
 
 
 def wait_for_router(

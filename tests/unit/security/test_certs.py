@@ -7,7 +7,8 @@ import json
 import logging
 import os
 import socket
-from datetime import UTC, datetime, timedelta
+import time
+from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from cryptography.x509.verification import PolicyBuilder, Store
 
 from schemas.topics import TOPICS
+from services.bus import credentials
 from services.bus.access_control import access_control
 from services.bus.credentials import (
     AUTHORITY,
@@ -309,6 +311,37 @@ def test_validity_in_time_is_checked(folder: Path, caplog: pytest.LogCaptureFixt
         check_credentials(folder / "truck-1", now + timedelta(days=340))
     assert "cert.pem expires on" in caplog.text
     assert "PRIVATE" not in caplog.text
+
+
+def test_service_that_keeps_trying_warns_of_expiry_once_a_day(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    soon = datetime.now(UTC) + timedelta(days=340)
+    with caplog.at_level(logging.WARNING):
+        for hours in (0, 0, 23, 25):
+            check_credentials(folder / "truck-1", soon + timedelta(hours=hours))
+    assert caplog.text.count("cert.pem expires on") == 2
+
+
+def test_running_router_logs_that_its_certificate_has_expired(
+    folder: Path,
+    tls_endpoint: str,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class NextYear(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> "NextYear":
+            return super().now(tz) + timedelta(days=400)
+
+    monkeypatch.setattr(credentials, "_LOOK_S", 0.05)
+    with caplog.at_level(logging.ERROR), open_session(listen=tls_endpoint, tls=folder / "logger"):
+        assert not caplog.records
+        monkeypatch.setattr(credentials, "datetime", NextYear)
+        deadline_s = time.monotonic() + 20.0
+        while not caplog.records and time.monotonic() < deadline_s:
+            time.sleep(0.02)
+    assert "logger/cert.pem expired on" in caplog.text
 
 
 def test_a_service_uses_its_own_credentials(folder: Path) -> None:
