@@ -5,7 +5,11 @@ numba's compiler keeps each tuple in one 256-bit register, which it does not ach
 loops over arrays. None of the functions allocates.
 """
 
+import logging
+import threading
+from collections.abc import Callable
 from functools import partial
+from typing import Any, TypeVar, cast
 
 from numba import config, njit
 
@@ -20,10 +24,57 @@ Lanes = tuple[float, float, float, float]
 
 LANES = 4
 
-# A wrapper for calls from C or Python contains another copy of the kernel, which takes as long to
-# compile; none is called from C. Kernels copy rows by loops: an assignment to a slice checks its
-# shape, and the check takes three seconds to compile.
-compiled = partial(njit, cache=True, nogil=True, no_cfunc_wrapper=True)
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+_LOG = logging.getLogger("driveby.kernels")
+_WARNED = threading.Event()
+
+
+def compiled(**options: Any) -> Callable[[Function], Function]:
+    """Return the decorator that compiles a kernel with these options of numba's `njit`.
+
+    A wrapper for calls from C or Python contains another copy of the kernel, which takes as long to
+    compile; none is called from C. Kernels copy rows by loops: an assignment to a slice checks its
+    shape, and the check takes three seconds to compile.
+    """
+    of_numba: Any = njit  # the type stubs do not know all options
+
+    def decorate(function: Function) -> Function:
+        kernel: Any = of_numba(function, nogil=True, no_cfunc_wrapper=True, **options)
+        if kernel is not function:  # so it is with NUMBA_DISABLE_JIT
+            _store_if_possible(kernel)
+        return cast("Function", kernel)
+
+    return decorate
+
+
+def _store_if_possible(dispatcher: Any) -> None:
+    """Let numba store a kernel's machine code; without permission or room, it stores nothing.
+
+    The process then compiles the kernel itself: a full disk must not cost a crossing.
+    """
+    try:
+        dispatcher.enable_caching()
+    except RuntimeError as error:  # no folder that can be written
+        _warn_without_cache(str(error))
+        return
+    save = dispatcher._cache.save_overload
+
+    def save_if_possible(signature: object, code: object) -> None:
+        try:
+            save(signature, code)
+        except OSError as error:
+            _warn_without_cache(str(error))
+
+    dispatcher._cache.save_overload = save_if_possible
+
+
+def _warn_without_cache(cause: str) -> None:
+    """Log, once a process, that kernels are compiled anew."""
+    if not _WARNED.is_set():
+        _WARNED.set()
+        _LOG.warning("compiled kernels are not stored, so a start takes minutes: %s", cause)
+
 
 # A kernel contains a copy of each kernel that it calls, which is optimised together with it and may
 # round differently. Without inlining, the copy that is loaded first is run, so that a process that
