@@ -57,6 +57,15 @@ class Run(NamedTuple):
     gnss: GnssTrack
 
 
+class _EvenGrid(NamedTuple):
+    """Samples of a run on an even grid."""
+
+    first_ns: int
+    """Time of grid point 0 in ns since 1970 UTC."""
+    index: NDArray[np.int64]  # grid points that have a sample (n,)
+    channels: dict[str, Floats]  # (n,) each
+
+
 def sampling_rate_hz(time_s: Floats) -> float:
     """Return the rate of samples (n,) that are even but for gaps and jitter of the time stamps.
 
@@ -95,34 +104,45 @@ def run_to_messages(
     """
     toml = vehicle_toml(site, vehicle_id)
     for run in runs:
-        start_ns = _nanoseconds(min(run.accel_time_s[0], run.gnss.time_s[0]))
+        grid = _on_even_grid(run)
+        # A rounded first stamp may be later than its sample on the grid.
+        start_ns = min(
+            _nanoseconds(min(run.accel_time_s[0], run.gnss.time_s[0])),
+            _time_ns(grid, 0, run.rate_hz),
+        )
         info = VehicleInfo(start_ns, 0, 0, start_ns, vehicle_id, toml)
         key = Key(realm, "vehicle", vehicle_id, "info")
         yield Message(key, encode_info(info), start_ns, 0, start_ns, start_ns)
         yield from merge(
-            _accel_messages(run, realm, vehicle_id, start_ns),
+            _accel_messages(run.rate_hz, grid, realm, vehicle_id, start_ns),
             _gnss_messages(run, realm, vehicle_id, start_ns),
             key=lambda message: message.log_time_ns,
         )
 
 
-def _accel_messages(run: Run, realm: str, vehicle_id: str, start_ns: int) -> Iterator[Message]:
+def _accel_messages(
+    rate_hz: float, grid: _EvenGrid, realm: str, vehicle_id: str, start_ns: int
+) -> Iterator[Message]:
     key = Key(realm, "vehicle", vehicle_id, "accel")
-    first_ns, index, channels = _on_even_grid(run)
-    size = max(1, round(BATCH_S * run.rate_hz))
+    index = grid.index
+    size = max(1, round(BATCH_S * rate_hz))
     edges = [0, *(np.flatnonzero(np.diff(index) != 1) + 1), len(index)]
     starts = [s for a, b in pairwise(edges) for s in range(a, b, size)]
     for sequence, (a, b) in enumerate(pairwise([*starts, len(index)])):
-        time_ns = first_ns + round(int(index[a]) * NS_PER_S / run.rate_hz)
+        time_ns = _time_ns(grid, a, rate_hz)
         batch = AccelBatch(
             start_ns,
             sequence,
             time_ns - start_ns,
             time_ns,
-            {name: AccelChannel(run.rate_hz, values[a:b]) for name, values in channels.items()},
+            {name: AccelChannel(rate_hz, values[a:b]) for name, values in grid.channels.items()},
         )
-        sent_ns = time_ns + round((b - a) * NS_PER_S / run.rate_hz)
+        sent_ns = time_ns + round((b - a) * NS_PER_S / rate_hz)
         yield Message(key, encode_accel(batch), start_ns, sequence, time_ns, sent_ns)
+
+
+def _time_ns(grid: _EvenGrid, sample: int, rate_hz: float) -> int:
+    return grid.first_ns + round(int(grid.index[sample]) * NS_PER_S / rate_hz)
 
 
 def _gnss_messages(run: Run, realm: str, vehicle_id: str, start_ns: int) -> Iterator[Message]:
@@ -145,8 +165,8 @@ def _gnss_messages(run: Run, realm: str, vehicle_id: str, start_ns: int) -> Iter
             yield Message(key, encode(fix), start_ns, sequence, time_ns, time_ns)
 
 
-def _on_even_grid(run: Run) -> tuple[int, NDArray[np.int64], dict[str, Floats]]:
-    """Return the time of grid point 0 in ns, and index and values of the samples on the grid.
+def _on_even_grid(run: Run) -> _EvenGrid:
+    """Return the samples on the grid.
 
     Time stamps that deviate little from the grid were rounded, and the samples count as even. With
     larger deviations the clock is a real one that wanders, and the samples are interpolated.
@@ -157,7 +177,7 @@ def _on_even_grid(run: Run) -> tuple[int, NDArray[np.int64], dict[str, Floats]]:
     jitter = (relative - offset) * run.rate_hz - index
     first_ns = _nanoseconds(run.accel_time_s[0] + offset)
     if np.abs(jitter).max() <= _LARGEST_JITTER:
-        return first_ns, index, run.channels
+        return _EvenGrid(first_ns, index, run.channels)
     pieces: list[NDArray[np.int64]] = []
     values: dict[str, list[Floats]] = {name: [] for name in run.channels}
     position = index + jitter
@@ -168,7 +188,8 @@ def _on_even_grid(run: Run) -> tuple[int, NDArray[np.int64], dict[str, Floats]]:
         pieces.append(grid)
         for name, v in resampled.items():
             values[name].append(v)
-    return first_ns, np.concatenate(pieces), {n: np.concatenate(v) for n, v in values.items()}
+    joined = {name: np.concatenate(parts) for name, parts in values.items()}
+    return _EvenGrid(first_ns, np.concatenate(pieces), joined)
 
 
 def resample(

@@ -145,6 +145,16 @@ def test_time_stamps_that_were_rounded_are_taken_for_even() -> None:
     assert times == pytest.approx((START_S + true) * 1e9, abs=2e5)
 
 
+def test_first_stamp_may_be_later_than_its_even_sample() -> None:
+    true = START_S + np.arange(256) / 256.0
+    cut = np.floor(true * 1e4) / 1e4  # the first is exact, the others are early
+    found = messages(a_run(cut, np.zeros(256)))
+    first = decode_accel(next(m.payload for m in found if m.key.stream == "accel"))
+    assert first.device_time_ns == 0
+    assert first.wall_time_ns < START_S * 1e9
+    assert found[0].log_time_ns == first.wall_time_ns
+
+
 def test_gravity_and_downward_axes_are_taken_out() -> None:
     sensor = a_site("gravity_included = true\nup = [1, 1, -1, -1]\n").sensor
     still = np.full(3, 9.80665)
