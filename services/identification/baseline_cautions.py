@@ -43,11 +43,16 @@ def origin_caution(
 
     `now` and `then` are the realms of their crossings.
     """
+    which = simulated_alone(now, then)
+    return None if which is None else language.text(f"caution.simulated_{which}")
+
+
+def simulated_alone(now: Iterable[str], then: Iterable[str]) -> str | None:
+    """Return which of both was simulated, `baseline` or `crossings`, if the other was not."""
     kinds = [{is_simulated(realm) for realm in realms} for realms in (now, then)]
     if not all(kinds) or kinds[0] == kinds[1]:
         return None
-    which = "baseline" if True in kinds[1] else "crossings"
-    return language.text(f"caution.simulated_{which}")
+    return "baseline" if True in kinds[1] else "crossings"
 
 
 def baseline_cautions(

@@ -23,6 +23,7 @@ from services.history.validation_files import (
     validation_notes,
     validations_passed,
 )
+from services.identification.baseline_cautions import simulated_alone
 from services.identification.comparison import (
     Comparison,
     Estimate,
@@ -163,6 +164,8 @@ def _report(
     notes = tuple(validation_notes(validations, site, unvalidated, language))
     passed = validations_passed(records, language)
     basis = CautionBasis(bridge, view, used, before, combined, notes)
+    failed = ["validation_failed"] if has_failed_validation(unvalidated) else []
+    limits = [language.text(f"finding.{key}") for key in (*failed, *_other_origin(used, before))]
     return BridgeReport(
         bridge,
         view,
@@ -172,7 +175,7 @@ def _report(
         last.created,
         site,
         before,
-        _finding(view, crossings, stored, language, has_failed=has_failed_validation(unvalidated)),
+        _finding(view, crossings, stored, language, limits),
         " ".join((quality(view, crossings, language), *repeated(repeats, language), *passed)),
         tuple(cautions(basis, language)),
         not notes,
@@ -285,14 +288,21 @@ def _range_of(losses: Sequence[float], language: Language) -> str:
     return language.text(key, low=low, high=high)
 
 
+def _other_origin(used: Sequence[CrossingResult], before: Before | None) -> list[str]:
+    """Return the key of the limit where only the measurement or its baseline was simulated."""
+    realms = [{one.realm for one in some} for some in (used, before.crossings if before else ())]
+    which = simulated_alone(*realms)
+    return [] if which is None else [f"simulated_{which}"]
+
+
 def _finding(
     view: BridgeView,
     crossings: Sequence[CrossingResult],
     baseline: Estimate | None,
     language: Language,
-    *,
-    has_failed: bool,
+    limits: Sequence[str] = (),
 ) -> BridgeFinding:
+    """Return the finding; `limits` are the sentences that a headline must not go without."""
     if view.estimate is None:
         return _no_finding(crossings, language)
     single = tuple(_one_by_one(view, crossings, baseline, language))
@@ -305,9 +315,7 @@ def _finding(
     if view.comparison is None:
         return BridgeFinding("open", language.text("finding.incomparable"), wording)
     weak = view.comparison.weak
-    but = _but_implausible(view.comparison, language)
-    if has_failed:
-        but += " " + language.text("finding.validation_failed")
+    but = _but_implausible(view.comparison, language) + "".join(f" {one}" for one in limits)
     if weak and view.ambiguous_neighbours:
         numbers = language.listed([str(one.number) for one in weak])
         headline = language.choice("finding.near", len(weak), elements=numbers)

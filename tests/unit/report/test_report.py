@@ -857,7 +857,7 @@ def test_a_finding_is_sound_only_where_a_large_loss_would_hardly_be_missed(site:
 
 def test_elements_that_cannot_be_compared_are_not_called_sound(site: Site) -> None:
     view = bridge_reports([(Path("x.json"), fused(site, KNOWN), site)], None)[0]
-    found = _finding(view.view._replace(comparison=None), (), None, ENGLISH, has_failed=False)
+    found = _finding(view.view._replace(comparison=None), (), None, ENGLISH)
     assert found.kind == "open"
     alone = view._replace(finding=found, view=view.view._replace(comparison=None))
     steps = " ".join(next_steps(alone, ENGLISH))
@@ -1024,6 +1024,26 @@ def test_a_failed_site_validation_is_in_the_headline(site: Site, tmp_path: Path)
         assert report.finding.headline.endswith(failed)
         assert report.finding.kind == kind
     assert "appears less stiff" in report.finding.headline
+
+
+@pytest.mark.parametrize("code", ["en", "de"])
+def test_headline_names_a_simulated_side_of_a_comparison(
+    site: Site, tmp_path: Path, code: str
+) -> None:
+    language, then = language_of(code), tmp_path / "then.json"
+    for realms, key in (
+        (("sim-a", "live"), "simulated_baseline"),
+        (("live", "sim-a"), "simulated_crossings"),
+    ):
+        ratios = np.ones(7), RATIOS
+        before, now = (
+            results_of(site, some_crossing(name) | {"realm": realm}, used=name, ratios=some)
+            for name, realm, some in zip("ab", realms, ratios, strict=True)
+        )
+        then.write_text(results_json(before))
+        (report,) = bridge_reports([(Path("x.json"), now, site)], then, language=language)
+        appears = language.choice("finding.appears", 1)
+        assert report.finding.headline == f"{appears} {language.text(f'finding.{key}')}"
 
 
 @pytest.mark.parametrize("is_weak", [False, True])
