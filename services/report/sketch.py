@@ -13,7 +13,7 @@ from services.report.place import ends_of
 
 _SIZE = 172.0
 """Width and height of the sketch in its own units."""
-_HALF_LENGTH, _HALF_WIDTH, _TRACK = 50.0, 5.5, 13.0
+_HALF_LENGTH, _HALF_WIDTH, _TRACK = 42.0, 5.5, 13.0
 _COLOURS = {"weak": "#E69F00", "other": "#cfe3f1", "doubtful": "#f1f1f1"}
 
 
@@ -40,9 +40,9 @@ def sketch(report: BridgeReport, language: Language) -> Html:
     for direction in directions:
         forward = 1.0 if direction == "start_to_end" else -1.0
         parts.append(_arrow(angle, forward, _TRACK * (1.0 if forward > 0.0 else 1.6)))
-    parts.append(_label(angle, -_HALF_LENGTH - 15.0, 0.0, "0 m"))
+    parts.append(_label(angle, -_HALF_LENGTH - 18.0, 0.0, "0 m"))
     far = language.text("bridge.length", span_m=bridge.span_m)
-    parts.append(_label(angle, _HALF_LENGTH + 19.0, 0.0, far))
+    parts.append(_label(angle, _HALF_LENGTH + 23.0, 0.0, far))
     parts.append(_north(language))
     sides = ends_of(bridge, language)
     ways = [

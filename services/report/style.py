@@ -3,7 +3,7 @@
 from services.common.language import Language
 
 _CSS = """
-@page { size: A4; margin: 9mm 15mm 12mm; @bottom-right { content: "PAGE_NUMBER";
+@page { size: A4; margin: 8mm 15mm 11mm; @bottom-right { content: "PAGE_NUMBER";
   font: 8pt "DejaVu Sans", Verdana, Arial, sans-serif; color: #5b6570; } }
 * { box-sizing: border-box; }
 body { font: 10.5pt/1.38 "DejaVu Sans", Verdana, Arial, sans-serif; color: #1b1f24;
@@ -35,7 +35,8 @@ svg { width: 100%; height: auto; display: block; }
 .about { display: flex; gap: 4mm; align-items: flex-start; }
 .about .facts { flex: 1; min-width: 0; }
 .sketch { flex: 0 0 36mm; }
-.sketch text { font: 11px "DejaVu Sans", Verdana, Arial, sans-serif; fill: #3d4650; }
+.sketch svg { overflow: visible; }
+.sketch text { font: 14.5px "DejaVu Sans", Verdana, Arial, sans-serif; fill: #3d4650; }
 .option { white-space: nowrap; }
 .wide { overflow-x: auto; }
 .wide th:first-child { white-space: nowrap; }
@@ -67,32 +68,29 @@ tr.good td:first-child::before { content: "● "; }
 }
 @media print {
   body { padding: 0; font-size: 9.2pt; line-height: 1.28; }
-  h1 { font-size: 15pt; }
-  .sub { margin: 0; font-size: 8pt; }
+  h1 { display: inline; margin-right: 3mm; font-size: 15pt; }
+  .first .sub { display: inline-block; margin: 0; font-size: 8pt; }
   .finding { padding: 1.2mm 3mm; margin: 1.5mm 0; }
   .finding strong { font-size: 11.5pt; }
   figure, tr, .finding { break-inside: avoid; }
   .past, .words + .first { break-before: page; }
   .evidence table { font-size: 8.2pt; }
-  .evidence .facts { break-inside: avoid; }
-  .evidence figure svg { max-height: 54mm; }
+  .evidence th, .evidence td { padding-top: 0.3mm; padding-bottom: 0.3mm; }
   .measures table { font-size: 7.8pt; }
+  .measures small { font-size: 7pt; }
   .measures td, .measures th { padding-top: 0.2mm; padding-bottom: 0.2mm; line-height: 1.25; }
   .note.how { display: none; }
   .past figure svg { max-height: 175mm; }
-  .first figure.wide svg { max-height: 36mm; }
   .wide { overflow: visible; }
   h2, h3 { break-after: avoid; margin: 1.5mm 0 0; }
   h2 { font-size: 11pt; }
   .first p, .first ul { margin: 0.6mm 0; }
   .words { columns: 3; column-gap: 5mm; font-size: 7pt; line-height: 1.2; margin-top: 2mm; }
   .words h2 { font-size: 10pt; margin: 1mm 0 0; column-span: all; }
-  .words p { break-inside: avoid; margin: 0.5mm 0; }
+  .words p { margin: 0.5mm 0; }
   .finding p { margin: 0.3mm 0; }
-  .note, .first ul, .evidence ul { font-size: 7.8pt; line-height: 1.23; }
-  .first { font-size: 8.8pt; }
-  :lang(de) .first { font-size: 8.6pt; }
-  :lang(de) .note, :lang(de) .first ul { font-size: 7.4pt; line-height: 1.22; }
+  .note, .first ul, .evidence ul { font-size: 7.4pt; line-height: 1.22; }
+  .first { font-size: 8.6pt; }
   .first table { font-size: 8.2pt; line-height: 1.22; margin: 1mm 0; }
   .first th, .first td { padding-top: 0.3mm; padding-bottom: 0.3mm; }
   .sketch { flex-basis: 30mm; margin: 0; }

@@ -100,14 +100,15 @@ def draw_bridge(
     """
     listed = _listed(bridge) if with_heading else []
     lines = _heading(bridge) if with_heading else []
-    heading_in = 1.35 + 0.17 * max(0, len(lines) - 2) if with_heading else 0.55
-    # On a page of its own the width limits the size of its text.
-    panel_in, list_in = 3.6 if with_heading else 1.8, _ROW_IN * len(listed)
+    heading_in = 1.35 + 0.17 * max(0, len(lines) - 2) if with_heading else 0.47
+    # A report has room for a low panel, as wide as its text.
+    panel_in, list_in = 3.6 if with_heading else 1.35, _ROW_IN * len(listed)
     list_in += 0.35 if listed else 0.0
-    height = heading_in + panel_in + 0.5 + list_in
+    below_in = 0.5 if with_heading else 0.43
+    height = heading_in + panel_in + below_in + list_in
     figure = Figure(figsize=(WIDTH_IN, height), facecolor="white")
     FigureCanvasAgg(figure)
-    bottom = (list_in + 0.5) / height
+    bottom = (list_in + below_in) / height
     axes = figure.add_axes((LEFT, bottom, RIGHT - LEFT, panel_in / height))
     _draw_panel(axes, bridge, language)
     if with_heading:

@@ -35,7 +35,7 @@ from services.viewer.element_labels import (
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000")
 """Okabe and Ito's; more crossings than these are all in the first."""
-_HEIGHT_IN = 4.6
+_HEIGHT_IN = 3.4
 
 
 def draw_crossings(
@@ -45,7 +45,7 @@ def draw_crossings(
     figure = Figure(figsize=(WIDTH_IN, _HEIGHT_IN), facecolor="white")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(
-        2, 1, height_ratios=(3.0, 2.0), hspace=0.4, left=LEFT, right=RIGHT, top=0.93, bottom=0.11
+        2, 1, height_ratios=(3.0, 2.0), hspace=0.5, left=LEFT, right=RIGHT, top=0.91, bottom=0.13
     )
     rigidity, road = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
     bridge = crossings[0][1]

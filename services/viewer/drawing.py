@@ -311,18 +311,17 @@ def legend_beside_title(axes: Axes, also: Sequence[Line2D] = ()) -> None:
     handles = [*axes.get_legend_handles_labels()[0], *also]
     if not handles:
         return
-    is_long = len(handles) > 4
-    size, room = 8.5 if is_long else 9.0, 1.0
+    is_long, room = len(handles) > 4, 1.0
     for _ in range(2):
         legend = axes.legend(
             handles=handles,
             loc="lower right",
             bbox_to_anchor=(1.008, 0.985),
             ncols=len(handles),
-            columnspacing=1.1 if is_long else 1.6,
-            handlelength=1.8 if is_long else 2.4,
-            handletextpad=0.5 if is_long else 0.8,
-            fontsize=room * size,
+            columnspacing=0.8 if is_long else 1.6,
+            handlelength=1.5 if is_long else 2.4,
+            handletextpad=0.4 if is_long else 0.8,
+            fontsize=room * 9.0,
             borderpad=0.0,
         )
         room = axes.get_window_extent().width / legend.get_window_extent().width

@@ -17,6 +17,7 @@ from schemas.results import CrossingResult, Results, results_json
 from schemas.site import Site
 from services.cli import main as cli
 from services.common.language import ENGLISH, language_of
+from services.report.style import style_sheet
 from services.viewer.bridge_figure import _heading, draw_bridge
 from services.viewer.bridge_view import BridgeView, view_of_bridge
 from services.viewer.crossing_view import comparison_of, view_of_crossing
@@ -338,6 +339,27 @@ def test_values_above_long_intervals_keep_off_title_and_legend(
     values = [text for text in axes.texts if text.get_text()[:1].isdigit()]
     assert len(values) == 8
     assert all(text.get_window_extent().y1 <= top for text in values)
+
+
+@pytest.mark.parametrize("code", ["en", "de"])
+def test_report_letters_pictures_in_7_points_on_paper(site: Site, code: str) -> None:
+    """Pictures are as wide as the text: A4 less both margins."""
+    language, sheet = language_of(code), style_sheet(language_of(code)).partition("@media print")
+    assert "@page { size: A4; margin: 8mm 15mm 11mm;" in sheet[0]
+    narrowed = [line for line in sheet[2].splitlines() if "svg" in line]
+    assert narrowed == ["  .past figure svg { max-height: 175mm; }"]
+    results = results_of(site, some_crossing("a"), some_crossing("b", entry=60.0), used="a")
+    bridge = site.bridges[0]
+    baseline = view_of_bridge(bridge, results, None).estimate
+    views = [(n, view_of_crossing(one, bridge)) for n, one in enumerate(results.crossings)]
+    for figure in (
+        draw_bridge(
+            view_of_bridge(bridge, results, baseline), with_heading=False, language=language
+        ),
+        draw_crossings(views, language),
+    ):
+        points_per_point = (210.0 - 2.0 * 15.0) / (25.4 * figure.get_figwidth())
+        assert min(text.get_fontsize() for text in words(figure)) * points_per_point > 7.0
 
 
 def test_values_above_long_intervals_of_one_crossing_keep_off_the_title(site: Site) -> None:
