@@ -49,7 +49,7 @@ _KINDS: Final = (
 _LONGEST_FOOT: Final = 20
 """Largest number of lines of text after the last row."""
 _TIME: Final = re.compile(
-    r"\d{1,4}[-./ ]\w{1,4}\.?[-./ ]\d{1,4}\b.*|\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?.*|\d{8}T\d{6}.*"
+    r"\d{1,4}[-./ ]\w{1,4}\.?[-./ ]\d{1,4}(\b|T).*|\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?.*|\d{8}T\d{6}.*"
     r"|[NSEW] ?\d[\d. ]*|\d[\d. ]* ?[NSEW]|[NSEW]|[NSEW]? ?\d+ ?°.*"
 )
 """Times, and angles that are no plain numbers."""

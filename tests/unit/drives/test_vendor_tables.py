@@ -181,8 +181,8 @@ def named(unit: str) -> dict[str, Any]:
     return renamed(ACCEL, "Time", *(name.format(unit) for name in BODY))
 
 
-def channel_files() -> dict[str, str | bytes]:
-    each = {f"{n}.csv": table({"time_s": ACCEL["time_s"], n: ACCEL[n]}) for n in CHANNELS}
+def channel_files(accel: dict[str, Any] = ACCEL) -> dict[str, str | bytes]:
+    each = {f"{n}.csv": table({"time_s": accel["time_s"], n: accel[n]}) for n in CHANNELS}
     return each | {"positions.csv": table(GPS)}
 
 
@@ -360,6 +360,7 @@ VARIANTS: dict[str, Variant] = {
     ),
     "other names of files": Variant(lambda: {"run1.csv": table(ACCEL), "gnss1.csv": table(GPS)}),
     "a file for each channel": Variant(channel_files),
+    "a file for each channel, ISO": Variant(lambda: channel_files(dates(ACCEL, f"{ISO}+00:00"))),
     "one file for both": Variant(lambda: {"drive.csv": table(one_file())}),
     "one file, fixes held": Variant(
         lambda: {"drive.csv": table(one_file_held())}, "each fix is repeated"
