@@ -65,8 +65,10 @@ def read_folder(
     accel = {path.name.removeprefix("accel_"): path for path in folder.glob("accel_*.csv")}
     gps = {path.name.removeprefix("gps_"): path for path in folder.glob("gps_*.csv")}
     if not accel:
+        inside = sorted(path.name for path in folder.iterdir() if path.is_dir())
+        hint = f"; give each of its folders alone, such as {folder / inside[0]}" if inside else ""
         raise InputError(
-            f"{folder}: holds no accel_NN.csv, pairs accel_NN.csv and gps_NN.csv expected"
+            f"{folder}: holds no accel_NN.csv, pairs accel_NN.csv and gps_NN.csv expected{hint}"
         )
     for number in sorted(gps.keys() - accel.keys()):
         missing = folder / f"accel_{number}"

@@ -17,6 +17,7 @@ from services.drives.csv_import import read_folder, read_pair
 from services.drives.plausible import check_plausible, notes_of
 from services.drives.runs import Run
 from services.drives.tables.findings import Target
+from services.drives.tables.guesses import grouped
 from services.drives.tables.mapping import ImportMap
 from services.drives.tables.reading import Understood, understand
 from services.finding.placed import rates_hz
@@ -64,7 +65,7 @@ def csv_runs(
             "--preview shows them, --yes or a map (--preview --write-map MAP.toml, then --map "
             "MAP.toml) confirms them"
         )
-    for guess in found.guesses:
+    for guess in grouped(found.guesses):
         _log.log(logging.INFO if guess.kind == "form" else logging.WARNING, "%s", guess.text)
     return found.runs
 
@@ -73,8 +74,11 @@ def understood_runs(
     sources: Sequence[Path], site: Site, vehicle_id: str, how: HowToRead = AS_WRITTEN
 ) -> Understood:
     """Return the runs with all guesses, confirmed or not."""
-    if len(sources) > 2:
-        raise InputError(f"{len(sources)} files given, a folder or accel.csv gps.csv expected")
+    if len(sources) > 2 or (len(sources) == 2 and any(path.is_dir() for path in sources)):
+        raise InputError(
+            f"{len(sources)} files or folders given, one folder or accel.csv gps.csv expected; "
+            "import each folder alone, driveby identify takes several recordings"
+        )
     vehicle = site.vehicle(vehicle_id)
     exact: InputError | None = None
     if how.mapping is None:

@@ -1086,6 +1086,28 @@ def test_strange_drive_is_noted_and_read(
     assert plain.guesses == []
 
 
+def test_drives_in_folders_of_their_own_are_imported_one_by_one(tmp_path: Path) -> None:
+    (tmp_path / "day").mkdir()
+    folders = [written(tmp_path / "day" / name, two_runs()) for name in ("run-1", "run-2")]
+    with pytest.raises(InputError, match=r"holds no accel_NN.*each of its folders.*run-1"):
+        csv_runs([tmp_path / "day"], site_of(), "truck-x")
+    with pytest.raises(InputError, match=r"2 files or folders given.*import each folder alone"):
+        csv_runs(folders, site_of(), "truck-x")
+
+
+def test_accepted_guesses_are_logged_once_for_all_files(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = ("t", *(name.format("m/s2") for name in BODY))
+    files = two_runs()
+    for n, part in enumerate((slice(0, 1750), slice(1800, 3500))):
+        files[f"log_{n}.csv"] = table(renamed(rows(ACCEL, part), *names), ";")
+    folder = written(tmp_path / "drive", files)
+    csv_runs([folder], site_of(), "truck-x", AS_WRITTEN._replace(accepts_guesses=True))
+    (line,) = (record.getMessage() for record in caplog.records if "by their" in record.message)
+    assert line.startswith("log_0.csv and 1 more: by their names: sprung_front is column")
+
+
 def test_equal_guesses_of_several_files_are_one_and_units_come_first() -> None:
     units = "accelerations are in g"
     guesses = [
