@@ -74,7 +74,8 @@ def _report(asked: ReportOptions) -> int:
 
     output = asked.output
     if output.suffix not in (".html", ".htm"):
-        raise InputError(f"{output}: the name of an HTML file (.html) is expected")
+        also = f"; --pdf prints it to {output}, too" if output.suffix == ".pdf" else ""
+        raise InputError(f"{output}: the name of an HTML file (.html) is expected{also}")
     pdf = output.with_suffix(".pdf")
     check_validations(asked.validations)
     records = validations_folder(asked.validations)

@@ -566,6 +566,7 @@ def test_what_cannot_be_reported_is_one_line_and_leaves_nothing(
         ((tmp_path / "none.json", *with_site), "no such file"),
         ((site, *with_site), "not a results file"),
         ((found, *with_site, "-o", tmp_path / "r.txt"), "an HTML file (.html) is expected"),
+        ((found, *with_site, "-o", tmp_path / "r.pdf"), "; --pdf prints it to"),
         ((found, *with_site, "-o", tmp_path / "no" / "r.html"), "does not exist"),
         ((found, *with_site, "--baseline", changed("b", {}).with_name("x.json")), "no such file"),
         (
