@@ -90,7 +90,7 @@ def _start(
     if given_time is not None:
         return start_of(given_time, zone, where)
     if target.start is None or runs > 1:
-        several = 'of each run in [file.time] of a map, start = { 01 = "…" } (--map)'
+        several = f'of each run in [file.time] of a map, start = {{ {run} = "…" }} (--map)'
         how = several if runs > 1 else "with --start 2026-05-01T09:30:00+02:00"
         if part.times.format == "clock" and first_s > _LONG_S:
             midnight = "2026-05-01T00:00:00+02:00"

@@ -817,6 +817,17 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, str | bytes]], str]] = {
         lambda: pair(with_times(ACCEL, ACCEL["time_s"] - START_S)),
         "accel_00.csv: times count from the start of the drive, give that with --start",
     ),
+    "runs that each count from 0": (
+        lambda: {
+            name.replace("00", run): content
+            for run in ("03", "04")
+            for name, content in pair(
+                with_times(ACCEL, ACCEL["time_s"] - START_S),
+                with_times(GPS, GPS["time_s"] - START_S),
+            ).items()
+        },
+        'of each run in [file.time] of a map, start = { 03 = "…" }',
+    ),
     "day or month first": (
         lambda: {A: table(dates(ACCEL, "%m/%d/2026 %H:%M:%S.%f", -24 * 11)), P: table(GPS)},
         'give order = "dmy" or "mdy"',
