@@ -62,7 +62,7 @@ class _EvenGrid(NamedTuple):
 
     first_ns: int
     """Time of grid point 0 in ns since 1970 UTC."""
-    index: NDArray[np.int64]  # grid points that have a sample (n,)
+    points: NDArray[np.int64]  # numbers of the grid points that have a sample (n,)
     channels: dict[str, Floats]  # (n,) each
 
 
@@ -124,7 +124,7 @@ def _accel_messages(
     rate_hz: float, grid: _EvenGrid, realm: str, vehicle_id: str, start_ns: int
 ) -> Iterator[Message]:
     key = Key(realm, "vehicle", vehicle_id, "accel")
-    index = grid.index
+    index = grid.points
     size = max(1, round(BATCH_S * rate_hz))
     edges = [0, *(np.flatnonzero(np.diff(index) != 1) + 1), len(index)]
     starts = [s for a, b in pairwise(edges) for s in range(a, b, size)]
@@ -142,7 +142,7 @@ def _accel_messages(
 
 
 def _time_ns(grid: _EvenGrid, sample: int, rate_hz: float) -> int:
-    return grid.first_ns + round(int(grid.index[sample]) * NS_PER_S / rate_hz)
+    return grid.first_ns + round(int(grid.points[sample]) * NS_PER_S / rate_hz)
 
 
 def _gnss_messages(run: Run, realm: str, vehicle_id: str, start_ns: int) -> Iterator[Message]:
