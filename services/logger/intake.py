@@ -208,8 +208,8 @@ class Intake:
                 raise ValueError(
                     f"{where.stream}: sequence {sequence} received again with other content"
                 )
-            given_up = self._given_up.get(name)
-            if given_up is None or not given_up.remove_range(sequence, sequence):
+            given_up = self._given_up.get(name, Intervals())
+            if given_up.runs > MAX_RUNS or not given_up.remove_range(sequence, sequence):
                 return False
         stream.recent[identity] = crc
         if len(stream.recent) > _RECENT:

@@ -393,6 +393,16 @@ def test_message_that_arrives_after_it_was_given_up_is_written_once() -> None:
     assert intake.accept(message(2), NOW_NS) is None
 
 
+def test_messages_given_up_take_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every second one of a range leaves as many ranges."""
+    monkeypatch.setattr("services.logger.intake.MAX_RUNS", 3)
+    intake = make()
+    assert intake.accept(message(0), NOW_NS)
+    intake.mark_lost(GNSS, 1, 1, 20, NOW_NS)
+    late = [intake.accept(message(number), NOW_NS) for number in range(2, 20, 2)]
+    assert [one is not None for one in late] == [True] * 3 + [False] * 6
+
+
 def test_a_bad_message_from_a_spool_is_not_asked_for_for_ever() -> None:
     intake = make()
     intake.accept(message(0), NOW_NS)
