@@ -33,7 +33,7 @@ def silent(stage: str, fraction: float) -> None:
 @pytest.fixture(scope="module")
 def found() -> Optimum:
     site = default_site()
-    driven = drive(site, draw_truth(site, 3), 3)
+    driven = drive(site, draw_truth(site, 4), 4)
     settings = IdentificationSettings(method="pre", threads=1)
     (seen,) = crossing_data_only([driven.run], driven.site, settings)
     return find_optimum(inputs_of_seen(seen))
