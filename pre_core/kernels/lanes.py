@@ -5,8 +5,7 @@ numba's compiler keeps each tuple in one 256-bit register, which it does not ach
 loops over arrays. None of the functions allocates.
 """
 
-import logging
-import threading
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar, cast
@@ -25,9 +24,6 @@ Lanes = tuple[float, float, float, float]
 LANES = 4
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-
-_LOG = logging.getLogger("driveby.kernels")
-_WARNED = threading.Event()
 
 
 def compiled(**options: Any) -> Callable[[Function], Function]:
@@ -55,8 +51,8 @@ def _store_if_possible(dispatcher: Any) -> None:
     """
     try:
         dispatcher.enable_caching()
-    except RuntimeError as error:  # no folder that can be written
-        _warn_without_cache(str(error))
+    except RuntimeError:
+        _warn_without_cache("no folder for them can be written; NUMBA_CACHE_DIR names another")
         return
     save = dispatcher._cache.save_overload
 
@@ -64,16 +60,15 @@ def _store_if_possible(dispatcher: Any) -> None:
         try:
             save(signature, code)
         except OSError as error:
-            _warn_without_cache(str(error))
+            _warn_without_cache(error.strerror or str(error))
 
     dispatcher._cache.save_overload = save_if_possible
 
 
 def _warn_without_cache(cause: str) -> None:
-    """Log, once a process, that kernels are compiled anew."""
-    if not _WARNED.is_set():
-        _WARNED.set()
-        _LOG.warning("compiled kernels are not stored, so a start takes minutes: %s", cause)
+    """Warn that kernels are compiled anew; Python prints one warning for each cause."""
+    text = f"compiled kernels are not stored, so a start takes minutes: {cause}"
+    warnings.warn(text, RuntimeWarning, stacklevel=1)
 
 
 # A kernel contains a copy of each kernel that it calls, which is optimised together with it and may

@@ -196,7 +196,9 @@ def test_missing_files_and_places_are_named(
         capsys, "import", drive, "--site", site, "-o", none / "out.mcap"
     )
     three = [drive / "accel_00.csv"] * 3
-    assert "3 files given" in refused(capsys, "import", *three, "--site", site, "-o", output)
+    assert "3 files or folders given" in refused(
+        capsys, "import", *three, "--site", site, "-o", output
+    )
     assert listing(drive.parent) == before
 
 
