@@ -11,7 +11,7 @@ from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.site_file import load_site, parse_site, site_hash
 from schemas.topics import Message
-from schemas.validation_records import VehicleBridgePair
+from schemas.validation_records import METHOD_EDITION, VehicleBridgePair
 from services.common.errors import InputError
 from services.common.progress import Offset, no_progress
 from services.execution.blas import one_blas_thread
@@ -51,7 +51,7 @@ def header_of(site: Site, settings: IdentificationSettings, created_s: float) ->
         version=program_version(),
         created=created_s,
         site_hash=site_hash(site),
-        settings=settings.model_dump(mode="json"),
+        settings=settings.model_dump(mode="json") | {"method_edition": METHOD_EDITION},
         seed=settings.seed,
     )
 

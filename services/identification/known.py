@@ -50,9 +50,10 @@ def search_hash(header: ResultHeader) -> str:
     """Return the hash of everything that determines the result of a crossing.
 
     It covers method, seed, all settings that can change the result, and the site file; not the
-    program's version.
+    versions of program and method.
     """
-    settings = {k: v for k, v in header.settings.items() if k not in NOT_OF_THE_RESULT}
+    ignored = NOT_OF_THE_RESULT | {"method_edition"}
+    settings = {k: v for k, v in header.settings.items() if k not in ignored}
     text = json.dumps([header.site_hash, header.seed, settings], sort_keys=True)
     return sha256(text.encode()).hexdigest()[:16]
 

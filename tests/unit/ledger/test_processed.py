@@ -116,6 +116,7 @@ def header(**changes: object) -> ResultHeader:
 
 def test_one_and_two_threads_are_one_search() -> None:
     assert search_hash(header(threads=1)) == search_hash(header(threads=2))
+    assert search_hash(header(method_edition=1)) == search_hash(header())
     assert search_hash(header(starts=1)) != search_hash(header(starts=2))
     messages = messages_of(*THROUGH)
     published = published_by_worker(messages, SITE)
