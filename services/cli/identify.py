@@ -58,7 +58,7 @@ from services.identification.bridge_remarks import bridge_remarks
 from services.identification.bridge_state import FusionSettings
 from services.identification.methods import lacks_noise
 from services.ledger.baselines import Baselines, baselines_of, realms_of_bridges
-from services.notebook.inference import groups_beside
+from services.notebook.inference import groups_beside, origin_of
 from services.recordings.recording import read_messages
 from services.recordings.remote import Source, all_fetched, is_folder_of_recordings
 
@@ -108,7 +108,7 @@ def identify_command(
         kept = (
             DrawsOfCrossing(c.crossing_id, c.vehicle, c.bridge, draws[c.crossing_id]) for c in some
         )
-        write_draws(asked.draws, kept, groups_beside(asked.draws, some))
+        write_draws(asked.draws, kept, groups_beside(asked.draws, some), origin_of(found))
     return 0
 
 

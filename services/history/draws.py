@@ -56,14 +56,17 @@ def write_draws(
     path: Path,
     crossings: Iterable[DrawsOfCrossing],
     groups: "Mapping[str, xr.Dataset] | None" = None,
+    origin: Mapping[str, str] | None = None,
 ) -> None:
     """Write the draws of the crossings that have some; an existing file is replaced.
 
-    A NetCDF file also gets `groups` in addition to its group `posterior`.
+    A NetCDF file also gets `groups` in addition to its group `posterior`, and in each of them the
+    attributes `origin`.
     """
     some = [crossing for crossing in crossings if crossing.draws]
     if path.suffix == ".nc":
-        _write_netcdf(path, {"posterior": posterior(some), **(groups or {})})
+        every = {"posterior": posterior(some), **(groups or {})}
+        _write_netcdf(path, {name: one.assign_attrs(origin or {}) for name, one in every.items()})
         return
     if len(some) == 1:
         arrays: Mapping[str, NDArray[np.float64]] = some[0].draws

@@ -1,12 +1,14 @@
 """Prior draws and diagnostics of crossings, with their posterior draws, as ArviZ groups them."""
 
+import json
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from schemas.results import CrossingResult, Prior
+from schemas.results import CrossingResult, Prior, Results
 from services.common.arrays import Floats
 from services.common.extras import check_installed
 from services.history.draws import DrawsOfCrossing, posterior
@@ -40,6 +42,17 @@ def groups_beside(path: Path, crossings: Sequence[CrossingResult]) -> "dict[str,
     if path.suffix != ".nc" or not crossings:
         return {}
     return {"prior": prior_of(crossings), "sample_stats": statistics_of(crossings)}
+
+
+def origin_of(results: Results) -> dict[str, str]:
+    """Return the header of results as attributes of a group: versions, site, settings, seed."""
+    created = datetime.fromtimestamp(results.created, UTC)
+    return {
+        "created_at": created.isoformat(),
+        "inference_library_version": results.version,
+        "site_hash": results.site_hash,
+        "settings": json.dumps(results.settings),
+    }
 
 
 def prior_draws(prior: Prior) -> Floats:

@@ -24,7 +24,7 @@ from services.history.draws import (
     write_draws,
 )
 from services.notebook.arguments import file_of, wrong
-from services.notebook.inference import groups_beside, prior_of
+from services.notebook.inference import groups_beside, origin_of, prior_of
 from services.notebook.showing import MAX_SHOWN, all_as_html, as_html, counted, one_line
 
 if TYPE_CHECKING:
@@ -152,7 +152,8 @@ class Identification(NamedTuple):
     def to_netcdf(self, path: str | Path) -> None:
         """Write the draws, as `driveby identify --draws` does; `arviz.from_netcdf` reads `.nc`.
 
-        A `.nc` also holds the groups `prior` and `sample_stats`; arrays have `units`.
+        A `.nc` also holds the groups `prior` and `sample_stats`; arrays have `units`, and groups
+        the versions of program and method, the seed, the settings and the site's hash.
 
         Raise InputError without draws, or if xarray and h5netcdf are not installed and the file is
         no `.npz`.
@@ -161,7 +162,8 @@ class Identification(NamedTuple):
         check_draws_file(file)
         some = _with_draws(self.solutions, f"{file}: ")
         groups = groups_beside(file, [solution.crossing for solution in some])
-        write_draws(file, (_draws_of(solution) for solution in some), groups)
+        draws = (_draws_of(solution) for solution in some)
+        write_draws(file, draws, groups, origin_of(self.results))
 
     def to_json(self, path: str | Path) -> None:
         """Write results.json, as `driveby identify --json` does."""

@@ -29,6 +29,7 @@ from schemas.results import (
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
 from schemas.topics import Message
+from schemas.validation_records import METHOD_EDITION
 from services.cli import main as cli
 from services.common import extras
 from services.common.extras import install_command
@@ -333,6 +334,11 @@ def test_the_command_line_says_the_same(
     assert first.groups() == second.groups() == ["posterior", "sample_stats", "prior"]
     assert first.prior.equals(second.prior)
     assert first.posterior.equals(second.posterior)
+    for group in (first.posterior, second.sample_stats):
+        assert group.attrs["inference_library_version"] == mine["version"]
+        assert group.attrs["site_hash"] == mine["site_hash"]
+        assert json.loads(group.attrs["settings"]) == mine["settings"]
+    assert mine["settings"]["method_edition"] == METHOD_EDITION
     assert first.posterior.equals(found.posterior())
 
 
