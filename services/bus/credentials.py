@@ -45,8 +45,8 @@ AUTHORITY, CERTIFICATE, KEY, CONFIGURATION = "ca.pem", "cert.pem", "key.pem", "z
 _log = logging.getLogger(__name__)
 _WARN_BEFORE = timedelta(days=30)
 _WARN_AGAIN = timedelta(days=1)
-_LOOK_S = 3600.0
-"""Longest sleep between two looks at the clock, which does not run while a machine is suspended."""
+_CHECK_PERIOD_S = 3600.0
+"""Longest sleep between two checks: a sleep does not count the time of a suspended machine."""
 _CLOCK_TOLERANCE = timedelta(minutes=5)
 _warned: dict[tuple[Path, datetime], datetime] = {}
 """Time of the last warning by file and expiry: a service without a router checks every second."""
@@ -129,7 +129,7 @@ def _log_expiry(path: Path, expires: datetime) -> None:
         now = datetime.now(UTC)
         _warn_of_expiry(path, expires, now)
         left_s = (expires - now).total_seconds()
-        time.sleep(min(left_s + 0.1, _LOOK_S) if left_s > 0.0 else _LOOK_S)
+        time.sleep(min(left_s + 0.1, _CHECK_PERIOD_S) if left_s > 0.0 else _CHECK_PERIOD_S)
 
 
 def _warn_of_expiry(path: Path, expires: datetime, now: datetime) -> None:

@@ -334,7 +334,7 @@ def test_running_router_logs_that_its_certificate_has_expired(
         def now(cls, tz: tzinfo | None = None) -> "NextYear":
             return super().now(tz) + timedelta(days=400)
 
-    monkeypatch.setattr(credentials, "_LOOK_S", 0.05)
+    monkeypatch.setattr(credentials, "_CHECK_PERIOD_S", 0.05)
     with caplog.at_level(logging.ERROR), open_session(listen=tls_endpoint, tls=folder / "logger"):
         assert not caplog.records
         monkeypatch.setattr(credentials, "datetime", NextYear)
