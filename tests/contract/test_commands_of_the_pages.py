@@ -73,6 +73,7 @@ NOT_RUN = {
     "pytest tests/faults/test_cluster.py": ITSELF,
     'pip install -e ".[opensees]"': NETWORK,
     "python -m tests.benchmarks.cluster_scale --crossings 2000": LONG,
+    "python -m studies.scripts.linearised_errors --kind three-elements --crossings 25": LONG,
     "python -m studies.scripts.local_minima": LONG,
     "python -m studies.scripts.local_minima --site studies/scripts/lorry_24_m.toml "
     "--crossings 25": LONG,
