@@ -87,10 +87,10 @@ def about_truck(
         )
         if best is None or best.chi2_per_dof > _HOPELESS_START_CHI2:
             break
-        if _is_same_misfit(best, reached_chi2):
-            return best, evaluations
         if _is_fit(best) or evaluations > max_evaluations:
             break
+        if _is_same_misfit(best, reached_chi2):
+            return best, evaluations
     if best is None or best.unfinished is not None:
         return None, evaluations
     best, used = _best_bridge(best, strategy, max_evaluations - evaluations)
@@ -120,7 +120,7 @@ def _best_bridge(
 def _is_same_misfit(found: Optimum, reached_chi2: float) -> bool:
     """Return whether a completed fit ended at a misfit that other fits reached, too."""
     is_same = abs(found.chi2_per_dof - reached_chi2) < _SAME_MISFIT * reached_chi2
-    return is_same and found.unfinished is None and not _is_fit(found)
+    return is_same and found.unfinished is None
 
 
 def _is_fit(found: Optimum) -> bool:
