@@ -222,7 +222,7 @@ def print_elements(
     every = [elements[f"EI_{n}"] for n in range(1, len(bridge.lengths_m) + 1)]
     bounds = [one.q975 if has_meaning else one.mean for one in every]
     ratios = [
-        b / sound for b, sound in zip(bounds, bridge.nominal_flexural_rigidity_nm2, strict=True)
+        b / nominal for b, nominal in zip(bounds, bridge.nominal_flexural_rigidity_nm2, strict=True)
     ]
     digits_of_ei, digits_of_ratio = _digits(max(bounds) / 1e9, 2), _digits(10.0 * max(ratios), 3)
     table = Table(box=None, pad_edge=False)
@@ -237,14 +237,14 @@ def print_elements(
     if losses:
         table.add_column(f"probability\nloss>{'/'.join(percents)}", justify="right")
     start, unresolved, doubt = 0.0, unresolved_elements(every), "?" if is_doubtful else ""
-    for number, (length, sound) in enumerate(
+    for number, (length, nominal) in enumerate(
         zip(bridge.lengths_m, bridge.nominal_flexural_rigidity_nm2, strict=True), start=1
     ):
         p = elements[f"EI_{number}"]
         row = [f"EI_{number}", f"{start:.2f}", f"{start + length:.2f}"]
-        for unit, digits in ((1e9, digits_of_ei), (sound, digits_of_ratio)):
+        for unit, digits in ((1e9, digits_of_ei), (nominal, digits_of_ratio)):
             row.append(f"{p.mean / unit:.{digits}f}")
-            if has_meaning and not (losses and unit == sound):
+            if has_meaning and not (losses and unit == nominal):
                 row.append(f"{p.q025 / unit:.{digits}f} … {p.q975 / unit:.{digits}f}")
         if losses:
             of = {} if number in unresolved else losses.get(f"EI_{number}", {})

@@ -364,7 +364,7 @@ def _print(console: "Console", crossing: CrossingResult, drive: SimulatedDrive, 
     misses = 0
     for heading in ("truth", "estimate", "interval (95 %)", "contains the truth"):
         table.add_column(heading, justify="right")
-    for number, (sound, truth) in enumerate(
+    for number, (nominal_ei, truth) in enumerate(
         zip(nominal, drive.rigidity_ratios, strict=True), start=1
     ):
         p = parameters.get(f"EI_{number}")
@@ -373,10 +373,10 @@ def _print(console: "Console", crossing: CrossingResult, drive: SimulatedDrive, 
             continue
         interval, holds = "not valid *", "—"
         if has_meaning:
-            interval = f"{p.q025 / sound:.3f} … {p.q975 / sound:.3f}"
-            holds = "yes" if p.q025 <= truth * sound <= p.q975 else "no"
+            interval = f"{p.q025 / nominal_ei:.3f} … {p.q975 / nominal_ei:.3f}"
+            holds = "yes" if p.q025 <= truth * nominal_ei <= p.q975 else "no"
             misses += holds == "no"
-        table.add_row(f"EI_{number}", f"{truth:.3f}", f"{p.mean / sound:.3f}", interval, holds)
+        table.add_row(f"EI_{number}", f"{truth:.3f}", f"{p.mean / nominal_ei:.3f}", interval, holds)
     console.print(table)
     if misses:
         share = 100.0 * (1.0 - _INTERVAL ** len(nominal))

@@ -108,8 +108,8 @@ class Fusion(NamedTuple):
         for name, state in self.bridges.items():
             nominal = self.elements_of[name].nominal_flexural_rigidity_nm2
             rows = [
-                (element, *rigidity_cells(one, sound))
-                for (element, one), sound in zip(state.elements.items(), nominal, strict=True)
+                (element, *rigidity_cells(one, nominal_ei))
+                for (element, one), nominal_ei in zip(state.elements.items(), nominal, strict=True)
             ]
             table = html_table(("element", *RIGIDITY_HEAD), rows)
             parts.append(f"<p>{escape(self._line(name))}</p>{table}")

@@ -77,9 +77,9 @@ def _elements(crossing: CrossingResult, bridge: Bridge) -> list[tuple[str, Param
     known = crossing.parameters or {}
     nominal = bridge.nominal_flexural_rigidity_nm2
     return [
-        (name, known[name], known[name].mean / sound)
-        for name, sound in ((f"EI_{n + 1}", sound) for n, sound in enumerate(nominal))
-        if name in known
+        (name, known[name], known[name].mean / nominal_ei)
+        for number, nominal_ei in enumerate(nominal, start=1)
+        if (name := f"EI_{number}") in known
     ]
 
 

@@ -222,11 +222,11 @@ def element_rows(
 ) -> Iterator[dict[str, object]]:
     """Yield the columns of each element: place, `statistics` of its name, nominal value, ratio."""
     start_m = 0.0
-    for number, (length_m, sound) in enumerate(zip(lengths_m, nominal_nm2, strict=True), start=1):
+    for number, (length_m, nominal) in enumerate(zip(lengths_m, nominal_nm2, strict=True), start=1):
         name, stop_m = f"EI_{number}", start_m + length_m
         found = statistics(name)
         place: dict[str, object] = {"element": name, "from_m": start_m, "to_m": stop_m}
-        yield place | found | {"nominal": sound, "ratio": found["mean"] / sound}
+        yield place | found | {"nominal": nominal, "ratio": found["mean"] / nominal}
         start_m = stop_m
 
 

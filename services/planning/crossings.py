@@ -152,14 +152,14 @@ def _truth(crossing: PlannedCrossing, road: PlannedRoad) -> PosteriorAtTruth:
 def _run(crossing: PlannedCrossing, road: PlannedRoad) -> Run:
     """Simulate the crossing without noise, all axles on one profile."""
     site, speed = crossing.site, crossing.speed_m_per_s
-    sound = np.ones(site.bridges[0].elements)
+    undamaged = np.ones(site.bridges[0].elements)
     if site.vehicles[0].tandem is not None:
         of_road = (road.road_class, _ROAD_SEED)
         how = TandemDrive(of_road, speed_m_per_s=speed, forward=crossing.forward)
-        return drive_case(tandem_case(_with_damped_tyres(site), sound, how), 0).run
+        return drive_case(tandem_case(_with_damped_tyres(site), undamaged, how), 0).run
     return simulate_drive(
         site,
-        sound,
+        undamaged,
         DrivenRoad(road.road_class, _ROAD_SEED),
         speed_m_per_s=(speed, speed),
         forward=crossing.forward,
