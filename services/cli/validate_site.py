@@ -24,7 +24,7 @@ from services.common.road_class import assumed_road
 from services.common.truck_choice import TRUCK_CHOICES, truck_to_try
 from services.history.validation_files import frequent_reasons, save
 from services.simulation.trial_truth import CROSSINGS
-from services.simulation.validation_options import CertificateOptions
+from services.simulation.validation_options import SiteValidationOptions
 from services.simulation.validation_trial import (
     ValidationTrial,
     conditions_of,
@@ -48,7 +48,7 @@ _UNLIKE_PATHS: Final = ("twin_tyre_distance_m", "rear_axle_offset_m")
 """Keys of a vehicle whose axles do not follow the same path."""
 
 
-def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
+def validate_site_command(asked: SiteValidationOptions, console: "Console") -> int:
     """Validate every pair of the site, print a line for each; return 1 if one failed.
 
     InputError: a bad site file, an unknown vehicle or bridge, or a folder that is not writable.
@@ -99,7 +99,7 @@ def _has_surface(known: Site, pair: VehicleBridgePair) -> bool:
     return conditions_of(alone.vehicles[0], alone.bridges[0], alone).road == "surface"
 
 
-def _pairs(known: Site, asked: CertificateOptions) -> list[VehicleBridgePair]:
+def _pairs(known: Site, asked: SiteValidationOptions) -> list[VehicleBridgePair]:
     """Return the requested pairs; InputError for an unknown vehicle or bridge."""
     vehicles, bridges = [v.id for v in known.vehicles], [b.id for b in known.bridges]
     truck, bridge = asked.truck, asked.bridge

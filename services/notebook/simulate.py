@@ -192,7 +192,7 @@ def simulate(
             ),
             speed_m_per_s=speeds,
             forward=_is_forward(direction),
-            beyond=OutOfModelEffects(twist=twist_of(known.bridges[0])),
+            effects=OutOfModelEffects(twist=twist_of(known.bridges[0])),
         )
     return Simulation(drive, declared_site(known, density, drive.run.rate_hz))
 

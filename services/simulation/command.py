@@ -94,7 +94,7 @@ def _simulate_plane(
                 ),
                 speed_m_per_s=asked.speed,
                 forward=asked.direction == "start_to_end",
-                beyond=effects,
+                effects=effects,
             )
             drives.append(drive)
         site = declared_site(known, noise, drives[0].run.rate_hz)

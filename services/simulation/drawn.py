@@ -132,7 +132,7 @@ class CrossingTruth(NamedTuple):
     channels: ChannelErrors
     latency_s: float
     conditions: DriveConditions
-    left: DepartedVehicle | None = None
+    departed: DepartedVehicle | None = None
     """Vehicle on the bridge before."""
     paths: WheelPaths | None = None
     """Wheel paths on a 2-D road surface; None: both axles follow one profile."""
@@ -286,7 +286,7 @@ def drive(
         TimedMotion(motion, step_s, settling),
         DrivenRoad(how.road_class, how.road_seed, truth.paths),
         instruments_of(site, truth, densities, seed),
-        truth.left,
+        truth.departed,
     )
     return SimulatedCrossing(
         truth,

@@ -1,8 +1,8 @@
 """Crossings of a site's truck with a tandem whose truth is drawn from the priors of the site.
 
-As `drawn`, by the simulation with a left and a right side: axles behind one another in strips of
-a 2-D road surface, tyres, springs that may rub. Bearings are rigid, and the receiver's latency has
-its nominal value: the simulation has no others.
+The module is like `drawn`, with the simulation of left and right wheels: axles follow strips of a
+2-D road surface, and springs may have friction. Bearings are rigid, and the receiver's latency has
+its nominal value, because the simulation has no others.
 """
 
 from typing import Final, NamedTuple
@@ -25,8 +25,8 @@ from services.simulation.wide_crossings import (
 )
 
 
-class TandemWorld(NamedTuple):
-    """Properties of truck and road that a site file does not declare."""
+class TandemEffects(NamedTuple):
+    """Effects in truck and road that a site file does not declare."""
 
     friction_share: float = 0.0
     """Dry friction of the springs over their static load."""
@@ -38,7 +38,7 @@ class TandemWorld(NamedTuple):
     """Standard deviation of the lateral position between runs."""
 
 
-USUAL: Final = TandemWorld()
+USUAL: Final = TandemEffects()
 
 
 class DrawnTandem(NamedTuple):
@@ -56,7 +56,7 @@ class DrawnTandem(NamedTuple):
 
 
 def drawn_tandem(
-    site: Site, truth: CrossingTruth, seed: int, truck_seed: int, world: TandemWorld = USUAL
+    site: Site, truth: CrossingTruth, seed: int, truck_seed: int, effects: TandemEffects = USUAL
 ) -> DrawnTandem:
     """Simulate one crossing of the site's first truck, which has a tandem.
 
@@ -78,13 +78,13 @@ def drawn_tandem(
         how.noise_ug_per_rthz,
         rate_hz=how.rate_hz,
         has_receiver_errors=True,
-        friction_share=world.friction_share,
+        friction_share=effects.friction_share,
         support_springs=beam.support_rotational_stiffness_nm_per_rad,
-        surface=SurfaceOptions(None, world.offset_m, world.wander_m),
+        surface=SurfaceOptions(None, effects.offset_m, effects.wander_m),
     )
     case = tandem_case(site, beam.flexural_rigidity_nm2 / nominal, drive)
     truck = truck_with_tandem(drawn_vehicle(vehicle, truck_seed), drive)
-    behind = [axle._replace(outer_share=world.outer_share) for axle in truck.axles[1:]]
+    behind = [axle._replace(outer_share=effects.outer_share) for axle in truck.axles[1:]]
     receiver = site.receiver
     case = case._replace(
         seed=seed,
@@ -99,7 +99,7 @@ def drawn_tandem(
             WideRun(
                 how.speed_m_per_s,
                 how.forward,
-                world.wander_m * float(rng.standard_normal()),
+                effects.wander_m * float(rng.standard_normal()),
                 how.change_m_per_s,
                 how.period_s,
             ),

@@ -65,7 +65,7 @@ _MODES = 40
 LONGEST_STEP_S = 1e-4
 """Longest time step: the truth must be far more exact than the tested method."""
 SETTLE_S = 3.0
-"""Duration of the drive before its recording: it starts at rest on a rough road."""
+"""Duration of the drive before its recording, in which the start from rest decays."""
 _ROAD_SPACING_M = 0.01
 _CONTACT_PATCH_M = 0.2
 TRUCK_KEYS: Final = tuple(
@@ -89,7 +89,7 @@ class OutOfModelEffects(NamedTuple):
 
     support_rotational_stiffness_nm_per_rad: tuple[float, float] = (0.0, 0.0)
     support_compliance_m_per_n: tuple[float, float] = (0.0, 0.0)
-    left: DepartedVehicle | None = None
+    departed: DepartedVehicle | None = None
     friction_share: float = 0.0
     """Dry friction of the suspension over its static load."""
     friction_load_growth: float = 0.0
@@ -220,18 +220,18 @@ def simulate_drive(
     *,
     speed_m_per_s: tuple[float, float] = (experiment.SPEED_M_PER_S, experiment.SPEED_M_PER_S),
     forward: bool = True,
-    beyond: OutOfModelEffects = NO_EFFECTS,
+    effects: OutOfModelEffects = NO_EFFECTS,
 ) -> SimulatedDrive:
     """Drive the site's first truck over its first bridge.
 
     The speed changes evenly from the first to the second value over the recording. A twist in
-    `beyond` gives the offset of the lane. Raise FailureError if the coupled simulation does not
+    `effects` gives the offset of the lane. Raise FailureError if the coupled simulation does not
     converge.
     """
     vehicle, bridge = site.vehicles[0], site.bridges[0]
-    car, beam = with_effects(truck_of(vehicle), beam_of(bridge, rigidity_ratios), beyond)
-    if beyond.twist is not None:
-        road = road._replace(lane_offset_m=beyond.twist.lane_offset_m)
+    car, beam = with_effects(truck_of(vehicle), beam_of(bridge, rigidity_ratios), effects)
+    if effects.twist is not None:
+        road = road._replace(lane_offset_m=effects.twist.lane_offset_m)
     rate = measurement.rate_hz or max(site.sensor.rate_hz)
     every = max(1, round(1.0 / (rate * LONGEST_STEP_S)))
     step_s = 1.0 / (rate * every)
@@ -263,7 +263,7 @@ def simulate_drive(
             np.random.default_rng(road.seed if measurement.seed is None else measurement.seed),
             vehicle.gps_antenna_to_front_axle_m,
         ),
-        beyond.left,
+        effects.departed,
     )[:2]
     ratios = np.asarray(rigidity_ratios, dtype=np.float64)
     return SimulatedDrive(run, roads.front, ratios, None if road.paths is None else roads.rear)
@@ -276,11 +276,11 @@ def measured_run(
     driven: TimedMotion,
     road: DrivenRoad,
     instruments: Instruments,
-    left: DepartedVehicle | None = None,
+    departed: DepartedVehicle | None = None,
 ) -> tuple[Run, AxleRoads, CoupledResponse]:
     """Drive `car` over `beam` along a motion and measure it with one sensor per channel.
 
-    After a vehicle has `left` the bridge, it vibrates when the first wheel enters. Return the
+    After a `departed` vehicle the bridge vibrates when the first wheel enters. Return the
     recording, the road under the tyres and the response of truck and bridge. Raise FailureError if
     the coupled simulation does not converge.
     """
@@ -291,19 +291,19 @@ def measured_run(
     reach = car.wheelbase_m + 1.0
     if road.paths is None:
         low, high = motion.position_m.min() - reach, motion.position_m.max() + reach
-        groove = contact_patch_average(_profile(low, high, road.kind, road.seed), _CONTACT_PATCH_M)
-        roads = AxleRoads(groove, groove)
+        profile = contact_patch_average(_profile(low, high, road.kind, road.seed), _CONTACT_PATCH_M)
+        roads = AxleRoads(profile, profile)
     else:
         assert isinstance(road.kind, str)  # noqa: S101 - a profile has no width
         of_class, spacing_m = (road.kind, road.seed), _ROAD_SPACING_M
         roads = roads_of_surface(bridge, motion, reach, spacing_m, of_class, road.paths, place_rng)
-    felt = under_axles(*roads, motion, car.wheelbase_m, sign)
+    under = under_axles(*roads, motion, car.wheelbase_m, sign)
     mesh = refine(beam, _PARTS)
     count = min(_MODES * (1 + len(mesh.interior_supports)), _freedoms(mesh))
     swing = None
-    if left is not None:
-        swing = InitialVibration(free_vibration_after(mesh, modes(mesh, count), *left))
-    fine = simulate(car, mesh, motion, felt, Discretisation(step_s, count), swing=swing)
+    if departed is not None:
+        swing = InitialVibration(free_vibration_after(mesh, modes(mesh, count), *departed))
+    fine = simulate(car, mesh, motion, under, Discretisation(step_s, count), swing=swing)
     if not fine.converged:
         raise FailureError("the simulation did not converge: are the site's values possible?")
     recorded = fine.acceleration_m_per_s2[settling_steps:]
@@ -400,23 +400,23 @@ def beam_of(bridge: Bridge, rigidity_ratios: Floats) -> Beam:
     )
 
 
-def with_effects(car: HalfCar, beam: Beam, beyond: OutOfModelEffects) -> tuple[HalfCar, Beam]:
+def with_effects(car: HalfCar, beam: Beam, effects: OutOfModelEffects) -> tuple[HalfCar, Beam]:
     """Return the truck and bridge with out-of-model effects."""
     loads = static_axle_loads_n(car, STANDARD_GRAVITY_M_PER_S2)
     friction = [
-        beyond.friction_share * (load - STANDARD_GRAVITY_M_PER_S2 * unsprung)
+        effects.friction_share * (load - STANDARD_GRAVITY_M_PER_S2 * unsprung)
         for load, unsprung in zip(loads, car.unsprung_mass_kg, strict=True)
     ]
     return car._replace(
         dry_friction_n=(friction[0], friction[1]),
-        friction_load_growth=beyond.friction_load_growth,
-        bilinear_damping=beyond.bilinear_damping,
-        air_spring_exponent=beyond.air_spring_exponent,
+        friction_load_growth=effects.friction_load_growth,
+        bilinear_damping=effects.bilinear_damping,
+        air_spring_exponent=effects.air_spring_exponent,
     ), beam._replace(
-        support_rotational_stiffness_nm_per_rad=beyond.support_rotational_stiffness_nm_per_rad,
-        support_compliance_m_per_n=beyond.support_compliance_m_per_n,
-        torsional_flexibility_per_n=beyond.twist.flexibility_per_n if beyond.twist else 0.0,
-        torsional_wave_speed_m_per_s=beyond.twist.wave_speed_m_per_s if beyond.twist else 0.0,
+        support_rotational_stiffness_nm_per_rad=effects.support_rotational_stiffness_nm_per_rad,
+        support_compliance_m_per_n=effects.support_compliance_m_per_n,
+        torsional_flexibility_per_n=effects.twist.flexibility_per_n if effects.twist else 0.0,
+        torsional_wave_speed_m_per_s=effects.twist.wave_speed_m_per_s if effects.twist else 0.0,
     )
 
 

@@ -1,6 +1,6 @@
 """Drives of a site file's truck with a tandem: the truth of `two_sided` for `driveby simulate`.
 
-The plane simulation of `drive` has two axles; this one has a left and a right side, and a bogie.
+The plane simulation of `drive` has two axles; this one has left and right wheels, and a bogie.
 """
 
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -251,6 +251,6 @@ def _deck(bridge: Bridge, ratios: Floats, how: TandemDrive) -> Deck:
     )
     if how.torsion is None:
         return deck
-    sound = deck._replace(flexural_rigidity_nm2=tuple(rigidity.tolist()))
-    first = float(bending_frequencies_hz(sound, 1)[0])
+    undamaged = deck._replace(flexural_rigidity_nm2=tuple(rigidity.tolist()))
+    first = float(bending_frequencies_hz(undamaged, 1)[0])
     return deck._replace(torsion=Torsion(how.torsion[0] * first, how.torsion[1]))

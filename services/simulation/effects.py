@@ -1,4 +1,4 @@
-"""Names of the effects that `worlds` adds to a crossing; the command's help lists them."""
+"""Names of the out-of-model effects of `driveby validate`; the command's help lists them."""
 
 from typing import Final
 
@@ -19,6 +19,6 @@ AMONG_ALL: Final = (
 TORSION: Final = "torsion"
 LEFT_AND_RIGHT: Final = "left-and-right"
 ON_SURFACES: Final = (SURFACE, TORSION, LEFT_AND_RIGHT, PAVEMENT)
-"""Effects that `everything` leaves out: results on such a road would show little of the others."""
+"""Effects that `everything` leaves out: such a road would hide most of the others."""
 ALONE: Final = (*AMONG_ALL, *ON_SURFACES)
 EFFECTS: Final = (*ALONE, EVERYTHING)

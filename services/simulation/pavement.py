@@ -5,7 +5,7 @@ Only simulations have these; the method knows none of their ranges or shapes.
 - On the bridge the slopes of the surface are multiplied by a factor, so that its heights continue
   the road's without a jump.
 - A joint is a dip or a step at an end of the deck. Its size varies laterally by a tenth (standard
-  deviation), so that axles with different tyres feel nearly the same joint.
+  deviation), so that axles with different tyres meet nearly the same joint.
 - An anisotropic surface is an isotropic one stretched laterally: left and right resemble each other
   more, and a profile along any line keeps its spectrum.
 """
@@ -41,7 +41,7 @@ PLAIN: Final = Pavement()
 
 
 def on_stretched_surface(axle: Footprint, anisotropy: float) -> Footprint:
-    """Return the axle that feels on an isotropic surface what `axle` feels on a stretched one."""
+    """Return the axle that has on an isotropic surface the profile of `axle` on a stretched one."""
     return axle._replace(
         width_m=axle.width_m / anisotropy,
         twin_distance_m=axle.twin_distance_m / anisotropy,

@@ -16,7 +16,7 @@ class SurveyKind(NamedTuple):
     """Relative standard deviation of EI from crossing to crossing; common to all elements in every
     other survey, each element's own in the others."""
     tyres: str | None = None
-    """Behind, on a road that is a surface; None: both axles feel one groove."""
+    """Rear tyres, on a 2-D road surface; None: both axles follow one profile."""
     offset_m: float = 0.005
     wander_m: float = 0.12
     masses_kg: tuple[float | None, ...] = (None,)
@@ -24,9 +24,10 @@ class SurveyKind(NamedTuple):
     both_ways: bool = False
     elements: int | None = None
     everything: bool = False
-    """Springs that rub, bearings that give, damped tyres, a lorry that has just left."""
+    """Whether all effects are added: suspension friction, compliant bearings, damped tyres and a
+    lorry that has just left the bridge."""
     scenario: int | None = None
-    """EI is that of this scenario of the paper, all elements at one level that is drawn."""
+    """Scenario of the paper with the ratios of EI; the level common to all elements is drawn."""
     ei_ratios: tuple[float, ...] | None = None
     """Ratios of EI instead of a scenario; with neither, each element's EI is drawn."""
     noise_ug_per_rthz: float = 25.0
@@ -37,10 +38,10 @@ class SurveyKind(NamedTuple):
     anisotropy: float = 1.0
     """Lateral correlation length of the surface over that of an isotropic one."""
     has_tandem: bool = False
-    """Trucks without a mass of their own have an equalised tandem, on a surface; `offset_m` is that
-    of its second axle."""
+    """Whether trucks without a mass in `masses_kg` have an equalised tandem, on a 2-D surface;
+    `offset_m` is then that of its second axle."""
     friction_share: float = 0.0
-    """Friction of its springs over their static load."""
+    """Friction of the tandem's springs over their static load."""
 
 
 KINDS: Final = {

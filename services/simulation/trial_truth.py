@@ -43,8 +43,8 @@ def drawn_truth(
     weak = int(rng.integers(bridge.elements))
     ratios = np.ones(bridge.elements)
     ratios[weak] = WEAK_RATIO
-    sound = beam_of(bridge, ratios).flexural_rigidity_nm2
-    return truth._replace(beam=truth.beam._replace(flexural_rigidity_nm2=sound)), weak
+    rigidity = beam_of(bridge, ratios).flexural_rigidity_nm2
+    return truth._replace(beam=truth.beam._replace(flexural_rigidity_nm2=rigidity)), weak
 
 
 def _mass_score(first_seed: int, number: int) -> float:

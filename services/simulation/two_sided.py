@@ -1,4 +1,4 @@
-"""Trucks and bridges with width: left and right sides, roll, bogies and a deck that twists.
+"""Three-dimensional trucks and bridges: left and right wheels, roll, bogies, a deck that twists.
 
 This is the truth of validations beyond the plane half-car. It shares no physics, mesh or integrator
 with `pre_core`: a program tested by its own simulator would not notice its own errors.

@@ -1,7 +1,7 @@
 """Options of `driveby validate`: one class for each of its four kinds.
 
-The names are those of the command's options. Certificates are made by the program itself, the
-other three are studies of the checkout. Nothing heavy is imported here.
+The names are those of the command's options. The program itself makes site validations; the other
+three kinds are studies in the checkout. Nothing heavy is imported here.
 """
 
 from dataclasses import dataclass
@@ -9,8 +9,8 @@ from pathlib import Path
 
 
 @dataclass(frozen=True, kw_only=True)
-class CertificateOptions:
-    """Certificates for the pairs of a site file."""
+class SiteValidationOptions:
+    """Options of the site validation of every pair in a site file."""
 
     site: Path
     truck: str | None
@@ -18,21 +18,21 @@ class CertificateOptions:
     bridge: str | None
     """Identifier of the only bridge; None: each."""
     validations: Path
-    """Folder of the certificates."""
+    """Folder of the validation records."""
     seed: int
     processes: int
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioOptions:
-    """The paper's scenarios by both of its searches."""
+    """Options of the paper's scenarios, identified by random walk and least squares."""
 
     scenarios: tuple[int, ...]
     noise: float
     """Noise density of the accelerometers in µg/√Hz."""
     seed: int
     site: Path | None
-    """None: truck and bridge of the paper."""
+    """Site file; None: truck and bridge of the paper."""
     particles: int
     steps: int
     json: Path | None
@@ -42,7 +42,7 @@ class ScenarioOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class IntervalOptions:
-    """The intervals of method `pre` against the truth of simulated crossings."""
+    """Options of the comparison of intervals with the truth of simulated crossings."""
 
     crossings: int
     """Number of crossings whose truth is drawn from the priors."""
@@ -65,7 +65,7 @@ class IntervalOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyOptions:
-    """Fused surveys of method `pre` against their truth."""
+    """Options of the comparison of fused surveys with their truth."""
 
     surveys: int
     """Number of surveys of each kind."""

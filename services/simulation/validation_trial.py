@@ -8,8 +8,9 @@ class; a 2-D surface where the site file describes tyres on different wheel path
 crossing the bridge is undamaged except for one element of half its rigidity, so that the trial
 includes what is to be detected.
 
-`judge_trial` is the rule (studies/site-validation.md; studies/scripts/certificate_rates.py computes
-its error rates). It judges crossings in the order of their seeds, so one seed gives one record.
+`judge_trial` is the rule of acceptance (studies/site-validation.md), whose error rates
+studies/scripts/certificate_rates.py computes. It judges crossings in the order of their seeds, so
+one seed gives one record.
 """
 
 import logging
@@ -57,14 +58,15 @@ LARGEST_Z_GOOD: Final = 5.0
 SURE_COVERAGE: Final = 0.93
 SURE_RMS_Z: Final = 1.2
 """Largest RMS score at which `FEWEST` crossings, all good, suffice."""
-TAKEN_FOR_SOUND: Final = 0.75
-"""Lower end of the interval of a weak element above which its loss counts as missed."""
+MISSED_ABOVE: Final = 0.75
+"""Lower end of a weak element's interval above which its loss counts as missed, as a share of its
+undamaged value."""
 FOUND_BELOW: Final = 0.9
 _SPEED_M_PER_S: Final = 10.0
 _ROAD_CLASS: Final = "B"
 """Road class where the site file has none."""
 _SEEDS: Final = 1000
-"""Distance of the crossings' seeds between two seeds of trials."""
+"""Difference of the crossings' seeds between two successive seeds of trials."""
 _SHOWN_EVERY_S: Final = 10.0
 
 
@@ -221,7 +223,7 @@ def one_crossing(
     conditions = conditions_of(site.vehicles[0], bridge, site)
     truth, weak = drawn_truth(site, conditions, seed, number)
     nominal = np.array(bridge.nominal_flexural_rigidity_nm2)
-    went_in = {
+    given = {
         "seed": seed,
         "direction": "start_to_end" if truth.conditions.forward else "end_to_start",
         "weak_element": None if weak is None else weak + 1,
@@ -234,8 +236,10 @@ def one_crossing(
         return _not_simulated(site, seed)
     found = identify_simulated([run], declared, settings)
     if len(found) != 1:
-        return ValidationCrossing.model_validate(went_in | {"verdict": "not_found"})
-    return ValidationCrossing.model_validate(went_in | _came_out(found[0].result, nominal.tolist()))
+        return ValidationCrossing.model_validate(given | {"verdict": "not_found"})
+    return ValidationCrossing.model_validate(
+        given | _result_fields(found[0].result, nominal.tolist())
+    )
 
 
 def _driven(
@@ -256,8 +260,8 @@ def _not_simulated(site: Site, seed: int) -> ValidationCrossing:
     )
 
 
-def _came_out(result: CrossingResult, nominal: list[float]) -> dict[str, object]:
-    came: dict[str, object] = {
+def _result_fields(result: CrossingResult, nominal: list[float]) -> dict[str, object]:
+    fields: dict[str, object] = {
         "verdict": result.verdict,
         "reasons": tuple(str(reason) for reason in result.reasons),
         "evaluations": int(
@@ -265,13 +269,14 @@ def _came_out(result: CrossingResult, nominal: list[float]) -> dict[str, object]
         ),
     }
     if result.parameters is None:
-        return came
+        return fields
     elements = [result.parameters[f"EI_{e + 1}"] for e in range(len(nominal))]
     for key in ("q025", "q50", "q975"):
-        came[f"ei_ratio_{key}"] = tuple(
-            getattr(element, key) / sound for element, sound in zip(elements, nominal, strict=True)
+        fields[f"ei_ratio_{key}"] = tuple(
+            getattr(element, key) / nominal_ei
+            for element, nominal_ei in zip(elements, nominal, strict=True)
         )
-    return came
+    return fields
 
 
 class CrossingErrors(NamedTuple):
@@ -338,9 +343,9 @@ def judge_trial(tried: Sequence[ValidationCrossing]) -> TrialOutcome | None:
     """
     figures = figures_of(tried)
     elements = len(tried[0].ei_ratio) if tried else 0
-    against = _against(tried, figures, elements)
-    if against is not None:
-        return TrialOutcome(False, against)
+    objection = _objection(tried, figures, elements)
+    if objection is not None:
+        return TrialOutcome(False, objection)
     is_sure = (
         figures.good == figures.crossings >= FEWEST
         and figures.covered >= SURE_COVERAGE * figures.intervals
@@ -348,10 +353,10 @@ def judge_trial(tried: Sequence[ValidationCrossing]) -> TrialOutcome | None:
     )
     if figures.crossings < CROSSINGS and not is_sure:
         return None
-    return TrialOutcome(True, _for(tried, figures))
+    return TrialOutcome(True, _passing_reason(tried, figures))
 
 
-def _against(
+def _objection(
     tried: Sequence[ValidationCrossing], figures: ValidationFigures, elements: int
 ) -> str | None:
     """Return an objection that no further crossing could remove."""
@@ -365,7 +370,7 @@ def _against(
                 f"the crossing of seed {one.seed} is good, but element {element} of it is wrong by "
                 f"{worst:.1f} standard deviations; at most {LARGEST_Z_GOOD:g} are allowed"
             )
-        if one.weak_element is not None and _of_weak(one.ei_ratio_q025, one) > TAKEN_FOR_SOUND:
+        if one.weak_element is not None and _of_weak(one.ei_ratio_q025, one) > MISSED_ABOVE:
             return (
                 f"the crossing of seed {one.seed} is good, but it takes element "
                 f"{one.weak_element}, which has lost half of its EI, for undamaged"
@@ -411,7 +416,7 @@ def _why_not(tried: Sequence[ValidationCrossing]) -> str:
     return ", ".join(listed)
 
 
-def _for(tried: Sequence[ValidationCrossing], figures: ValidationFigures) -> str:
+def _passing_reason(tried: Sequence[ValidationCrossing], figures: ValidationFigures) -> str:
     """Return the figures of a trial that passed, each with its limit."""
     missed, allowed = figures.intervals - figures.covered, figures.most_missed
     others = _why_not(tried)

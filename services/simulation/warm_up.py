@@ -1,7 +1,7 @@
 """Compile the kernels of simulations ahead of time: `python -m services.simulation.warm_up`.
 
-It ends `make install` beside `services.execution.warm_up`, which says why. Without it the first
-`driveby survey` would compile for half a minute.
+`make install` runs it after `services.execution.warm_up`, which gives the reason. Without it the
+first `driveby survey` would compile for half a minute.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""Crossings of trucks and bridges with width, and their sensors.
+"""Crossings of three-dimensional trucks and bridges (`two_sided`), and their sensors.
 
 A case is one truck, bridge, road, set of sensors and the site file of its owner, with any number of
 runs. `two_sided` simulates it. Accelerometers have gain, delay, bias and white noise; a receiver
@@ -202,8 +202,10 @@ def road_under(
         strips.append(Strip(place, axle.tyre_width_m, axle.contact_length_m))
     if is_one_road:
         strips = [Strip(0.0, 0.0, truck.axles[0].contact_length_m)] * len(strips)
-    felt = {s: heights_m(waves, s, start_m, _ROAD_SPACING_M, count) for s in dict.fromkeys(strips)}
-    return WideRoad(start_m, _ROAD_SPACING_M, np.stack([felt[strip] for strip in strips]))
+    heights = {
+        s: heights_m(waves, s, start_m, _ROAD_SPACING_M, count) for s in dict.fromkeys(strips)
+    }
+    return WideRoad(start_m, _ROAD_SPACING_M, np.stack([heights[strip] for strip in strips]))
 
 
 def sensor_row(truck: WideTruck, sensor: WideSensor) -> Floats:

@@ -21,7 +21,7 @@ _OVERVIEW = "scenarios.png"
 
 
 def run(asked: ScenarioOptions, console: "Console") -> int:
-    """Run scenarios, print the table, write the requested files; 0 also for a missed aim."""
+    """Run scenarios, print the table, write the requested files; 0 also for a missed target."""
     if asked.json is not None:
         check_writable(asked.json)
     if asked.figures is not None:
@@ -45,7 +45,7 @@ def run(asked: ScenarioOptions, console: "Console") -> int:
 
 
 def _run_scenarios(asked: ScenarioOptions, console: "Console") -> list[Scenario]:
-    car, sound = models(asked.site)
+    car, undamaged = models(asked.site)
     number, steps = len(asked.scenarios), asked.steps
     start_line(console, f"searching in {count_of(number, 'scenario')}, {steps} steps each")
     with progress_bar(console) as progress:
@@ -54,7 +54,7 @@ def _run_scenarios(asked: ScenarioOptions, console: "Console") -> list[Scenario]
             run_scenario(
                 number,
                 car,
-                sound,
+                undamaged,
                 asked,
                 lambda text, steps: progress.update(task, description=text, advance=steps),
             )

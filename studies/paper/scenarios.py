@@ -71,7 +71,7 @@ NAMES = _names(parameters.paper_subset(experiment.ELEMENTS))
 def run_scenario(
     number: int,
     car: HalfCar,
-    sound: Beam,
+    undamaged: Beam,
     asked: ScenarioOptions,
     progress: Callable[[str, int], None] = lambda text, steps: None,
 ) -> Scenario:
@@ -84,14 +84,14 @@ def run_scenario(
         progress(f"scenario {number}: {text}", by)
 
     ratios = experiment.scenario_ratios(number)
-    damaged = sound._replace(flexural_rigidity_nm2=sound.flexural_rigidity_nm2 * ratios)
+    damaged = undamaged._replace(flexural_rigidity_nm2=undamaged.flexural_rigidity_nm2 * ratios)
     try:
         window = paper_window(car, damaged, asked.noise, asked.seed)
     except ArithmeticError as error:
         raise FailureError(f"{error}: are the site's values possible?") from error
-    nominal = from_models(car, sound)
+    nominal = from_models(car, undamaged)
     free = parameters.paper_subset(experiment.ELEMENTS)
-    free = free[nominal[free] > 0.0]  # a site may say that a damping is exactly zero
+    free = free[nominal[free] > 0.0]  # a site may declare a damping of exactly zero
     names = _names(free)
     true_ratio = dict.fromkeys(names, 1.0)
     true_ratio |= {f"EI_{e + 1}": float(ratio) for e, ratio in enumerate(ratios)}

@@ -3,8 +3,9 @@
     python -m studies.scripts.local_minima [--site SITE.toml] [--crossings 56]
 
 Crossings are drawn as for a site validation. Each is identified, and fitted again from its truth,
-which nobody knows: a search that ended lower in the log posterior missed that bridge. One that
-ended higher found another bridge that explains the data as well, which is no failure of a search.
+which is unknown for real crossings: a search that ended lower in the log posterior missed that
+bridge. One that ended higher found another bridge that explains the data as well, which is no
+failure of a search.
 """
 
 import argparse

@@ -37,8 +37,8 @@ from services.simulation.survey_kinds import KINDS
 from studies.simulation.truths import default_site
 from studies.validation.bound import at_truth, central_jacobian
 from studies.validation.calibration import Record, record
+from studies.validation.misspecification import HEADINGS, cells, completed, lines_of, read_records
 from studies.validation.surveys import crossing_truth, site_of_truck
-from studies.validation.worlds import HEADINGS, cells, completed, lines_of, read_records
 
 _KINDS = {"twin": "twin", "single": "single-5"}
 _NOISES = ("as on the road", "estimated", "known")

@@ -1,1 +1,1 @@
-"""Drawn crossings beyond the physics of the method, simulated by `services.simulation`."""
+"""Drawn crossings with physics that the method lacks, simulated by `services.simulation`."""

@@ -1,4 +1,4 @@
-"""Drives of a half-car and a beam with width: the truth of `two_sided` for a run.
+"""Drives of a half-car and a beam extended to three dimensions: the truth of `two_sided` for a run.
 
 `Width` holds the properties beyond a plane truck and bridge (roll, tracks, torsion, the lane).
 Sensors on the centre line, or left and right, become the four channels of every method.

@@ -89,7 +89,7 @@ class OutOfModelTruth(NamedTuple):
     truth: CrossingTruth
     site: Site
     """Nominal values except noise; for continuous bridges, with the supports."""
-    beyond: OutOfModelEffects
+    effects: OutOfModelEffects
     width: Width | None
     """Properties of truck and bridge beyond the plane; None: none."""
 
@@ -115,7 +115,7 @@ def draw_out_of_model(site: Site, effect: str, seed: int) -> OutOfModelTruth:
     springs = rng.uniform(*SPRUNG_EI_PER_SPAN, 2)
     softest, hardest = BEARINGS_N_PER_M
     bearings = softest * (hardest / softest) ** rng.uniform(size=2)
-    left = _draw_departed(rng)
+    departed = _draw_departed(rng)
     tyres = rng.uniform(*TYRE_DAMPING_NS_PER_M, 2)
     share, length = float(rng.uniform(*FRICTION_SHARE)), float(rng.uniform(*FRICTION_LENGTH_M))
     body_noise = _draw_log_uniform(rng, *BODY_NOISE_UG)
@@ -137,10 +137,10 @@ def draw_out_of_model(site: Site, effect: str, seed: int) -> OutOfModelTruth:
     drawn = draw_truth(site, seed)
     sprung = [has("sprung") and (alone or bool(other)) for other in every_other[1:3]]
     springs *= site.bridges[0].support_rotational_stiffness_nm_per_rad_scale_at_zero
-    beyond = OutOfModelEffects(
+    effects = OutOfModelEffects(
         _pair(springs * sprung),
         _pair(1.0 / bearings if has("sinking") else np.zeros(2)),
-        left if has("swing") else None,
+        departed if has("swing") else None,
         share if has("friction") else 0.0,
         1.0 if has("friction") and every_other[3] else 0.0,
         bilinear if has("bilinear") else 0.0,
@@ -149,7 +149,7 @@ def draw_out_of_model(site: Site, effect: str, seed: int) -> OutOfModelTruth:
     car, beam = _plain(drawn.car, drawn.beam)
     if has("tyres"):
         car = car._replace(tyre_damping_ns_per_m=_pair(tyres))
-    car, beam = with_effects(car._replace(friction_length_m=length), beam, beyond)
+    car, beam = with_effects(car._replace(friction_length_m=length), beam, effects)
     conditions = drawn.conditions
     if has("friction"):
         conditions = conditions._replace(body_noise_ug_per_rthz=body_noise)
@@ -161,15 +161,17 @@ def draw_out_of_model(site: Site, effect: str, seed: int) -> OutOfModelTruth:
         width = _twisting(_paths(site, rear_offset, PLAIN), lateral, site, beam)
     if has(LEFT_AND_RIGHT):
         width = _leaning(_paths(site, rear_offset, PLAIN), lateral, site, drawn, car)
-    truth = drawn._replace(car=car, beam=beam, conditions=conditions, left=beyond.left, paths=paths)
-    return OutOfModelTruth(truth, site, beyond, width)
+    truth = drawn._replace(
+        car=car, beam=beam, conditions=conditions, departed=effects.departed, paths=paths
+    )
+    return OutOfModelTruth(truth, site, effects, width)
 
 
-def drive_out_of_model(world: OutOfModelTruth, seed: int) -> SimulatedCrossing:
+def drive_out_of_model(case: OutOfModelTruth, seed: int) -> SimulatedCrossing:
     """Simulate and measure one crossing; `seed` is that of noise and receiver."""
-    if world.width is None:
-        return drive(world.site, world.truth, seed)
-    return drive_wide(world.site, world.truth, world.width, seed)
+    if case.width is None:
+        return drive(case.site, case.truth, seed)
+    return drive_wide(case.site, case.truth, case.width, seed)
 
 
 def _draw_departed(rng: np.random.Generator) -> DepartedVehicle:

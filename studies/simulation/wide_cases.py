@@ -1,4 +1,4 @@
-"""Cases with width: drawn trucks and decks that twist, and trucks with more axles than declared.
+"""Three-dimensional cases: decks that twist, and trucks with more axles than declared.
 
 The owner knows total mass and axle distances; all other values of the site file are those of the
 undamaged bridge and of the truck within SITE_ERROR.

@@ -128,7 +128,7 @@ def _on_its_road(
     )
     level = expected_levels(front, rear, truth.conditions.road_class)
     # The body equations have full weight until the nuisances are fitted: their residuals are
-    # read off the rows.
+    # taken from the rows.
     ratio = truth.paths.pavement.deck_roughness
     return update_noise(
         problem._replace(mismatch=mismatch),

@@ -178,8 +178,8 @@ def in_processes(
 # Statistics of many records
 
 
-class Aim(NamedTuple):
-    """One aim: a measured value, and its limits."""
+class Target(NamedTuple):
+    """One target: a measured value, and its limits."""
 
     name: str
     measured: float | None
@@ -189,7 +189,7 @@ class Aim(NamedTuple):
 
     @property
     def is_met(self) -> bool:
-        """Return whether it is met; an aim without a measurement is not."""
+        """Return whether it is met; a target without a measurement is not."""
         return self.measured is not None and self.low <= self.measured <= self.high
 
 
@@ -269,11 +269,11 @@ def rank_tests(records: list[Record]) -> dict[str, dict[str, statistics.Uniformi
     }
 
 
-def checks(records: list[Record]) -> list[Aim]:
-    """Return the aims of well-specified crossings (docs/validation.md)."""
+def checks(records: list[Record]) -> list[Target]:
+    """Return the targets of well-specified crossings (docs/validation.md)."""
     s = scores(records)
     if s.seeds.size < 2:
-        return [Aim("crossings with numbers", float(s.seeds.size), 2.0, np.inf)]
+        return [Target("crossings with numbers", float(s.seeds.size), 2.0, np.inf)]
     pooled = statistics.pooled_share(s.is_covered.astype(np.float64))
     each = s.is_covered.mean(axis=0)
     ratio = float(np.nanmean(s.std_log) / np.nanmean(s.bound))
@@ -281,16 +281,16 @@ def checks(records: list[Record]) -> list[Aim]:
     worst = np.maximum(np.abs(s.z), np.abs(s.z_log))[s.is_good]
     tests = rank_tests(records)
     return [
-        Aim("pooled coverage", pooled.value, 0.93, 0.97, f"± {pooled.error:.3f}"),
-        Aim("coverage of each element, least", float(each.min()), 0.90, 0.99),
-        Aim("coverage of each element, most", float(each.max()), 0.90, 0.99),
-        Aim("root mean square of z, ln EI", statistics.root_mean_square(s.z_log), 0.9, 1.15),
-        Aim("root mean square of z, EI", statistics.root_mean_square(s.z), 0.9, 1.15),
-        Aim("mean standard deviation over bound", ratio, 0.0, 1.25),
-        Aim("share good", float(good), 0.95, 1.0),
-        Aim("largest |z| among good", float(worst.max()) if worst.size else None, 0.0, 5.0),
+        Target("pooled coverage", pooled.value, 0.93, 0.97, f"± {pooled.error:.3f}"),
+        Target("coverage of each element, least", float(each.min()), 0.90, 0.99),
+        Target("coverage of each element, most", float(each.max()), 0.90, 0.99),
+        Target("root mean square of z, ln EI", statistics.root_mean_square(s.z_log), 0.9, 1.15),
+        Target("root mean square of z, EI", statistics.root_mean_square(s.z), 0.9, 1.15),
+        Target("mean standard deviation over bound", ratio, 0.0, 1.25),
+        Target("share good", float(good), 0.95, 1.0),
+        Target("largest |z| among good", float(worst.max()) if worst.size else None, 0.0, 5.0),
         *(
-            Aim(
+            Target(
                 f"ranks of {group}, p",
                 statistics.bonferroni_p_value(
                     np.array([test.p_value for test in of_group.values()])

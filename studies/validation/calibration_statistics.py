@@ -52,7 +52,7 @@ def pooled_share(hits: FloatArray) -> Share:
 
 
 def root_mean_square(z: FloatArray) -> float:
-    """Return the root mean square of standardised errors (…): 1 for true intervals."""
+    """Return the root mean square of standardised errors (…): 1 for calibrated intervals."""
     return float(np.sqrt(np.mean(z * z)))
 
 

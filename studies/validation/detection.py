@@ -1,4 +1,4 @@
-"""Detection of weak elements over numbers of crossings, and false accusations.
+"""Detection of weak elements by numbers of crossings, and false detections.
 
 The simulated surveys have an EI by a scenario of the paper. Each survey's crossings are taken in
 consecutive groups of 1, 2, 4 and more, none in two groups of a size; each group is fused as in a
@@ -58,9 +58,9 @@ class DetectionSummary(NamedTuple):
     """Share in which its interval is below the other elements, by whatever loss."""
     loss: tuple[float, float, float] | None
     """Medians of the lower end, the middle and the upper end of the weak element's loss."""
-    accused: float | None
+    falsely_named: float | None
     """Share in which an undamaged element is named weak."""
-    sound_below: float | None
+    undamaged_below: float | None
     """Share of the undamaged elements whose interval is below the others."""
 
 
@@ -111,7 +111,7 @@ def _detected(kind: str, crossings: int, groups: Sequence[CrossingGroup]) -> Det
     comparison = [group.comparison for group in groups if group.comparison is not None]
     weak = groups[0].weak
     theirs = [[one for one in each.elements if one.number in weak] for each in comparison]
-    sound = [[one for one in each.elements if one.number not in weak] for each in comparison]
+    undamaged = [[one for one in each.elements if one.number not in weak] for each in comparison]
     losses = [(1.0 - one.high, 1.0 - one.ratio, 1.0 - one.low) for each in theirs for one in each]
     low, middle, high = np.median(losses, axis=0).tolist() if losses else (0.0, 0.0, 0.0)
     return DetectionSummary(
@@ -122,8 +122,8 @@ def _detected(kind: str, crossings: int, groups: Sequence[CrossingGroup]) -> Det
         _share([all(one.is_weak for one in each) for each in theirs if each]),
         _share([all(one.high < 1.0 for one in each) for each in theirs if each]),
         (low, middle, high) if losses else None,
-        _share([any(one.is_weak for one in each) for each in sound]),
-        _share([one.high < 1.0 for each in sound for one in each]),
+        _share([any(one.is_weak for one in each) for each in undamaged]),
+        _share([one.high < 1.0 for each in undamaged for one in each]),
     )
 
 
@@ -154,6 +154,6 @@ def cells(line: DetectionSummary) -> list[str]:
         percent(line.named),
         percent(line.below),
         loss,
-        percent(line.accused),
-        "–" if line.sound_below is None else f"{100.0 * line.sound_below:.1f} %",
+        percent(line.falsely_named),
+        "–" if line.undamaged_below is None else f"{100.0 * line.undamaged_below:.1f} %",
     ]

@@ -104,7 +104,7 @@ def _draw_coverage(axes: Axes, scores: Scores) -> None:
     axes.text(
         0.02,
         0.03,
-        "grey: aim; bars: one standard error",
+        "grey: target; bars: one standard error",
         transform=axes.transAxes,
         color=MUTED,
         fontsize=8.5,

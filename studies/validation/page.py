@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from schemas.validation_records import METHOD_EDITION
-from studies.validation.calibration import SMALLEST_P, Aim, Record, by_condition
+from studies.validation.calibration import SMALLEST_P, Record, Target, by_condition
+from studies.validation.misspecification import HEADINGS, cells, effect_checks, lines_of
 from studies.validation.uncertainty import (
     JUDGED,
     ValidationOutcome,
-    aims,
     control_checks,
     judged_checks,
     largest_z,
@@ -19,8 +19,8 @@ from studies.validation.uncertainty import (
     reasons_of,
     scenario_rows,
     summary,
+    targets,
 )
-from studies.validation.worlds import HEADINGS, cells, lines_of, world_checks
 
 _HEAD = """# Validation of method `pre`
 
@@ -33,7 +33,7 @@ No real bridge is among the crossings: no public recording of one is known.
 
 ## Targets
 
-{aims}
+{targets}
 
 {missed} of {all} targets are missed.{unlisted}
 """
@@ -165,16 +165,16 @@ _ELSEWHERE = """
 def validation_page(outcome: ValidationOutcome, image: str = "images/calibration.png") -> str:
     """Return the page as Markdown."""
     in_tables = [check for line in outcome.judged for check in judged_checks(line)]
-    in_tables += world_checks(outcome.worlds)
-    listed = aims(outcome._replace(judged=[], worlds=()))
+    in_tables += effect_checks(outcome.out_of_model)
+    listed = targets(outcome._replace(judged=[], out_of_model=()))
     listed += [check for check in in_tables if not check.is_met]
     text = _HEAD.format(
         command=_command(outcome),
         each=_each(outcome),
         edition=METHOD_EDITION,
-        aims=_aims(listed),
+        targets=_targets(listed),
         missed=sum(not check.is_met for check in listed),
-        all=len(aims(outcome)),
+        all=len(targets(outcome)),
         unlisted=_unlisted(in_tables),
     )
     if len(outcome.drawn) > 1:
@@ -183,8 +183,8 @@ def validation_page(outcome: ValidationOutcome, image: str = "images/calibration
         text += _control(outcome)
     if outcome.scenarios:
         text += _scenarios(outcome)
-    if outcome.worlds:
-        text += _worlds(outcome.worlds)
+    if outcome.out_of_model:
+        text += _effects_section(outcome.out_of_model)
     text += _judged(outcome) if outcome.judged else _NOT_JUDGED
     return text + _ELSEWHERE
 
@@ -199,11 +199,11 @@ def _command(outcome: ValidationOutcome) -> str:
 
 def _each(outcome: ValidationOutcome) -> int:
     """Return the number of crossings of each effect."""
-    effects = dict.fromkeys(record["effect"] for record in outcome.worlds)
-    return len(outcome.worlds) // max(1, len(effects))
+    effects = dict.fromkeys(record["effect"] for record in outcome.out_of_model)
+    return len(outcome.out_of_model) // max(1, len(effects))
 
 
-def _worlds(records: Sequence[Record]) -> str:
+def _effects_section(records: Sequence[Record]) -> str:
     lines = lines_of(records)
     of_effect = {
         line.effect: [record for record in records if record["effect"] == line.effect]
@@ -222,7 +222,7 @@ def _worlds(records: Sequence[Record]) -> str:
     )
 
 
-def _aims(checks: list[Aim]) -> str:
+def _targets(checks: list[Target]) -> str:
     rows = ["| target | measured | wanted | |", "| --- | --: | --: | --- |"]
     for check in checks:
         measured = "none" if check.measured is None else f"{check.measured:.3g}"
@@ -235,7 +235,7 @@ def _aims(checks: list[Aim]) -> str:
     return "\n".join(rows)
 
 
-def _unlisted(in_tables: Sequence[Aim]) -> str:
+def _unlisted(in_tables: Sequence[Target]) -> str:
     """Return how many targets of each effect and simulated run are met; "" without any."""
     all_of = Counter(check.name.split(":")[0] for check in in_tables)
     met_of = Counter(check.name.split(":")[0] for check in in_tables if check.is_met)
@@ -243,7 +243,7 @@ def _unlisted(in_tables: Sequence[Aim]) -> str:
     return _UNLISTED.format(met=met) if met else ""
 
 
-def _wanted(check: Aim) -> str:
+def _wanted(check: Target) -> str:
     if check.low == check.high:
         return f"{check.low:g}"
     if check.low == 0.0:

@@ -10,10 +10,17 @@ from services.common.progress import steps_bar
 from services.finding.placed import middle_site
 from services.simulation.validation_options import IntervalOptions
 from studies.simulation.truths import default_site
-from studies.validation.calibration import Aim, by_condition, ranks_of, scores
+from studies.validation.calibration import Target, by_condition, ranks_of, scores
+from studies.validation.misspecification import (
+    HEADINGS,
+    cells,
+    crossings_start,
+    lines_of,
+    read_records,
+    run_effects,
+)
 from studies.validation.uncertainty import (
     ValidationOutcome,
-    aims,
     as_json,
     largest_z,
     noises,
@@ -22,14 +29,7 @@ from studies.validation.uncertainty import (
     reasons_of,
     run_parts,
     scenario_rows,
-)
-from studies.validation.worlds import (
-    HEADINGS,
-    cells,
-    crossings_start,
-    lines_of,
-    read_records,
-    run_worlds,
+    targets,
 )
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ _FIGURE = "calibration.png"
 
 
 def run(asked: IntervalOptions, console: "Console") -> int:
-    """Run all parts, print their tables, write the requested files; 1 if an aim was missed."""
+    """Run all parts, print their tables, write the requested files; 1 if a target was missed."""
     for path in (asked.json, asked.page):
         if path is not None:
             check_writable(path)
@@ -65,7 +65,7 @@ def run(asked: IntervalOptions, console: "Console") -> int:
         from studies.validation.page import validation_page
 
         write_atomically(asked.page, validation_page(outcome))
-    all_checks = aims(outcome)
+    all_checks = targets(outcome)
     print_outcome(console, outcome, all_checks)
     return 0 if all(check.is_met for check in all_checks) else 1
 
@@ -86,7 +86,7 @@ def _outcome(asked: IntervalOptions, console: "Console") -> ValidationOutcome:
     if not asked.out_of_model:
         return outcome
     with steps_bar("crossings with more physics", console, start) as progress:
-        worlds = run_worlds(
+        out_of_model = run_effects(
             known,
             asked.effects,
             asked.out_of_model,
@@ -95,11 +95,11 @@ def _outcome(asked: IntervalOptions, console: "Console") -> ValidationOutcome:
             asked.processes,
             progress,
         )
-    return outcome._replace(worlds=worlds)
+    return outcome._replace(out_of_model=out_of_model)
 
 
-def print_outcome(console: "Console", outcome: ValidationOutcome, all_checks: list[Aim]) -> None:
-    """Print the tables of all parts, at most 80 characters wide, and the aims."""
+def print_outcome(console: "Console", outcome: ValidationOutcome, all_checks: list[Target]) -> None:
+    """Print the tables of all parts, at most 80 characters wide, and the targets."""
     from rich.table import Table
 
     def table(*columns: str) -> Table:
@@ -124,11 +124,11 @@ def print_outcome(console: "Console", outcome: ValidationOutcome, all_checks: li
         for row in scenario_rows(outcome):
             shown.add_row(*row)
         console.print(shown)
-    if outcome.worlds:
+    if outcome.out_of_model:
         console.print("[bold]more physics than the method has[/]", highlight=False)
         shown = table(*HEADINGS[:-2])
-        for world in lines_of(outcome.worlds):
-            shown.add_row(*(cell.replace(" %", "%") for cell in cells(world)[:-2]))
+        for effect in lines_of(outcome.out_of_model):
+            shown.add_row(*(cell.replace(" %", "%") for cell in cells(effect)[:-2]))
         console.print(shown)
     for line in outcome.judged:
         worst = largest_z(line)

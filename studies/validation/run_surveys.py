@@ -11,8 +11,8 @@ from services.simulation.validation_options import SurveyOptions
 from studies.simulation.truths import default_site
 from studies.validation import detection
 from studies.validation.forecasts import forecasts_of
+from studies.validation.misspecification import crossings_start, read_records
 from studies.validation.surveys import HEADINGS, fused_surveys, rows, run_surveys, survey_checks
-from studies.validation.worlds import crossings_start, read_records
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def run(asked: SurveyOptions, console: "Console") -> int:
-    """Simulate missing crossings, fuse, print a line for each kind; 1 if an aim was missed.
+    """Simulate missing crossings, fuse, print a line for each kind; 1 if a target was missed.
 
     The forecast of `driveby survey` is printed next to the results; for kinds with a weak element a
     second table has the number of crossings needed to detect it.

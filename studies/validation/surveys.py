@@ -5,7 +5,8 @@ speed (up to 15 % to either side), lateral position and the changes of the bridg
 is drawn as in `services.simulation.drawn`. Each crossing is identified by itself, as from a
 recording, then all of a survey are fused, as in a worker.
 
-Records are stored as in `studies.validation.worlds`: existing ones are not simulated again.
+Records are stored as in `studies.validation.misspecification`: existing ones are not simulated
+again.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,22 +27,22 @@ from services.drives.runs import Run
 from services.finding.placed import middle_site
 from services.identification.bridge_state import RecentCrossings, add_crossings, state_of, usable
 from services.simulation.drawn import CrossingTruth, draw_truth, drive, identify_simulated
-from services.simulation.drawn_tandem import TandemWorld, drawn_tandem
+from services.simulation.drawn_tandem import TandemEffects, drawn_tandem
 from services.simulation.drive import declared_site, ratios_of
 from services.simulation.pavement import Pavement
 from services.simulation.survey_kinds import KINDS, SurveyKind
 from services.simulation.usual_trucks import usual_tandem
 from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
 from studies.simulation.out_of_model import draw_out_of_model
-from studies.validation.calibration import Aim, Record
-from studies.validation.worlds import completed, identity_of, read_records
+from studies.validation.calibration import Record, Target
+from studies.validation.misspecification import completed, identity_of, read_records
 
 SPEED_M_PER_S, _FASTER = 10.0, 0.15
 _RATE_HZ = 500.0
 _BODY_NOISE_UG = 10.0
 """Noise density of the sensors on the body, where everything should be observable."""
 _FEWEST = 15
-"""Fewest surveys of a kind whose coverage is an aim in full."""
+"""Fewest surveys of a kind whose coverage is a target in full."""
 _LEVEL_SPREAD = 0.15
 """Spread of ln EI common to all elements of a scenario: a nominal value is a guess."""
 
@@ -82,8 +83,8 @@ def _driven(site: Site, of: SurveyKind, survey: int, number: int, truck: int) ->
     """Return the recorded run of a crossing, and the site that declares its sensors."""
     truth, seed = crossing_truth(site, of, survey, number, truck)
     if site.vehicles[0].tandem is not None:
-        world = TandemWorld(of.friction_share, of.offset_m, wander_m=of.wander_m)
-        return drawn_tandem(site, truth, seed, 1000 * survey + truck, world).recorded
+        effects = TandemEffects(of.friction_share, of.offset_m, wander_m=of.wander_m)
+        return drawn_tandem(site, truth, seed, 1000 * survey + truck, effects).recorded
     one = drive(site, truth, seed)
     return one.run, one.site
 
@@ -140,11 +141,11 @@ def crossing_truth(
     same = draw_truth(site, 1000 * survey + truck)
     rng = np.random.default_rng(np.random.SeedSequence([survey, number, 0x5E7]))
     bridge = _bridge(site, kind, survey)
-    car, left = same.car, None
+    car, departed = same.car, None
     if kind.everything:
-        world = draw_out_of_model(site, "everything", 1000 * survey)
-        car, left = world.truth.car, world.truth.left
-        bridge = world.truth.beam._replace(
+        case = draw_out_of_model(site, "everything", 1000 * survey)
+        car, departed = case.truth.car, case.truth.departed
+        bridge = case.truth.beam._replace(
             flexural_rigidity_nm2=bridge.flexural_rigidity_nm2,
             element_lengths_m=bridge.element_lengths_m,
             mass_per_length_kg_per_m=bridge.mass_per_length_kg_per_m,
@@ -174,7 +175,7 @@ def crossing_truth(
         asked = SurfaceOptions(kind.tyres, kind.offset_m, kind.wander_m, pavement)
         paths = wheel_paths_of(site.vehicles[0], asked)
     beam = bridge._replace(flexural_rigidity_nm2=bridge.flexural_rigidity_nm2 * np.exp(change))
-    truth = same._replace(car=car, beam=beam, conditions=conditions, left=left, paths=paths)
+    truth = same._replace(car=car, beam=beam, conditions=conditions, departed=departed, paths=paths)
     return truth, 100_000 * survey + number
 
 
@@ -374,14 +375,14 @@ def _percent(share: float) -> str:
     return f"{100.0 * share:.1f} %"
 
 
-def survey_checks(found: Sequence[FusedSurvey]) -> list[Aim]:
-    """Return the aims: calibrated intervals, and no element with a large error."""
+def survey_checks(found: Sequence[FusedSurvey]) -> list[Target]:
+    """Return the targets: calibrated intervals, and no element with a large error."""
     checks = []
     for kind in dict.fromkeys(one.kind for one in found):
         some = [one for one in found if one.kind == kind]
         z = np.concatenate([one.z for one in some])
         covered = float(np.mean(np.concatenate([one.inside for one in some])))
         few = len(some) < _FEWEST
-        checks.append(Aim(f"{kind}: coverage", covered, 0.85 if few else 0.92, 1.0))
-        checks.append(Aim(f"{kind}: largest |z|", float(np.abs(z).max()), 0.0, 4.0))
+        checks.append(Target(f"{kind}: coverage", covered, 0.85 if few else 0.92, 1.0))
+        checks.append(Target(f"{kind}: largest |z|", float(np.abs(z).max()), 0.0, 4.0))
     return checks

@@ -1,9 +1,9 @@
 """Validation of the uncertainty of method `pre`, in five parts.
 
-Simulated crossings from the priors of a site, with the statistics of `calibration` and aims. The
+Simulated crossings from the priors of a site, with the statistics of `calibration` and targets. The
 same with half the noise declared, a control that must fail. The paper's twelve scenarios with real
 sensors. Crossings of an independent simulator, where its folder exists. Crossings with out-of-model
-effects (`worlds`).
+effects (`misspecification`).
 """
 
 import json
@@ -35,8 +35,8 @@ from services.simulation.drive import (
 from studies.paper.tables import of_paper
 from studies.validation.bound import bound_at
 from studies.validation.calibration import (
-    Aim,
     Record,
+    Target,
     checks,
     distribution,
     elements_of,
@@ -44,7 +44,7 @@ from studies.validation.calibration import (
     one_crossing,
     scores,
 )
-from studies.validation.worlds import world_checks
+from studies.validation.misspecification import effect_checks
 
 SCENARIO_NOISE_UG = (25.0, 100.0)
 _SCENARIO_ROAD = "A"
@@ -81,7 +81,7 @@ class ValidationOutcome(NamedTuple):
     judged: list[Record]
     judged_from: Path | None
     """Folder of the independent simulator's crossings; None if it was absent."""
-    worlds: Sequence[Record] = ()
+    out_of_model: Sequence[Record] = ()
 
 
 def run_parts(
@@ -228,9 +228,9 @@ def _elements(seen: IdentifiedCrossing, truth: dict[str, float], bound: dict[str
     }
 
 
-def aims(outcome: ValidationOutcome) -> list[Aim]:
-    """Return all aims of the parts that were run."""
-    found: list[Aim] = []
+def targets(outcome: ValidationOutcome) -> list[Target]:
+    """Return all targets of the parts that were run."""
+    found: list[Target] = []
     if outcome.drawn:
         found += checks(outcome.drawn)
     if outcome.control:
@@ -238,21 +238,21 @@ def aims(outcome: ValidationOutcome) -> list[Aim]:
     found += scenario_checks(outcome.scenarios)
     for line in outcome.judged:
         found += judged_checks(line)
-    return found + world_checks(outcome.worlds)
+    return found + effect_checks(outcome.out_of_model)
 
 
-def control_checks(records: list[Record]) -> list[Aim]:
-    """Return the aims of the control: none good with half the noise declared, for this reason."""
+def control_checks(records: list[Record]) -> list[Target]:
+    """Return the targets of the control: half the noise declared, none good, for that reason."""
     good = np.mean([line["verdict"] == "good" for line in records])
     named = np.mean([bool(_NOISE_REASONS & set(line["reasons"])) for line in records])
     return [
-        Aim("half the noise: share good", float(good), 0.0, 0.02),
-        Aim("half the noise: named as misfit", float(named), 0.95, 1.0),
+        Target("half the noise: share good", float(good), 0.0, 0.02),
+        Target("half the noise: named as misfit", float(named), 0.95, 1.0),
     ]
 
 
-def scenario_checks(records: list[Record]) -> list[Aim]:
-    """Return the aims of scenario 12's weak edge element, and of the largest z of all."""
+def scenario_checks(records: list[Record]) -> list[Target]:
+    """Return the targets of scenario 12's weak edge element, and of the largest z of all."""
     found = []
     for line in records:
         if line["scenario"] == 12 and line["noise_ug_per_rthz"] == SCENARIO_NOISE_UG[0]:
@@ -262,12 +262,12 @@ def scenario_checks(records: list[Record]) -> list[Aim]:
                 if "mean" in element
                 else None
             )
-            found.append(Aim("scenario 12: error of EI_7", off, 0.0, _SCENARIO_12_WITHIN))
+            found.append(Target("scenario 12: error of EI_7", off, 0.0, _SCENARIO_12_WITHIN))
     if records:
         worst = [largest_z(line) for line in records]
         known = [z for z in worst if z is not None]
         value = max(known) if len(known) == len(worst) else None
-        found.append(Aim("scenarios: largest |z|", value, 0.0, 5.0))
+        found.append(Target("scenarios: largest |z|", value, 0.0, 5.0))
     return found
 
 
@@ -277,8 +277,8 @@ def largest_z(line: Record) -> float | None:
     return max(z, default=None)
 
 
-def judged_checks(line: Record) -> list[Aim]:
-    """Return the aims of one run of the independent simulator."""
+def judged_checks(line: Record) -> list[Target]:
+    """Return the targets of one run of the independent simulator."""
     tolerance = JUDGED[line["folder"]]
     name = f"{line['folder'].split('_')[0]} run {line['run']}"
     over, ratio = None, None
@@ -291,10 +291,10 @@ def judged_checks(line: Record) -> list[Aim]:
         )
         ratio = max(e["std"] / e["bound"] for e in elements)
     return [
-        Aim(f"{name}: error over allowed", over, 0.0, 1.0),
-        Aim(f"{name}: std over bound", ratio, 0.0, _LARGEST_STD_OVER_BOUND),
-        Aim(f"{name}: chi2", line["chi2_per_dof"], *_JUDGED_CHI2),
-        Aim(f"{name}: is good", float(line["verdict"] == "good"), 1.0, 1.0),
+        Target(f"{name}: error over allowed", over, 0.0, 1.0),
+        Target(f"{name}: std over bound", ratio, 0.0, _LARGEST_STD_OVER_BOUND),
+        Target(f"{name}: chi2", line["chi2_per_dof"], *_JUDGED_CHI2),
+        Target(f"{name}: is good", float(line["verdict"] == "good"), 1.0, 1.0),
     ]
 
 
@@ -350,19 +350,19 @@ def number(value: float | None) -> str:
 
 
 def as_json(outcome: ValidationOutcome) -> dict[str, Any]:
-    """Return records and aims of all parts."""
+    """Return records and targets of all parts."""
     return {
-        "aims": [check._asdict() | {"is_met": check.is_met} for check in aims(outcome)],
+        "aims": [check._asdict() | {"is_met": check.is_met} for check in targets(outcome)],
         "drawn": outcome.drawn,
         "control": outcome.control,
         "scenarios": outcome.scenarios,
         "judged": outcome.judged,
-        "worlds": list(outcome.worlds),
+        "worlds": list(outcome.out_of_model),
     }
 
 
 def summary(records: list[Record]) -> dict[str, Any]:
-    """Return the figures of the page on simulated crossings against the aims."""
+    """Return the figures of the page on simulated crossings against the targets."""
     s = scores(records)
     return {
         "elements": elements_of(records),

@@ -1,4 +1,4 @@
-"""Aims and tables of a validation on records that were made up: met by true intervals only."""
+"""Targets and tables of a validation on records that were made up: met by true intervals only."""
 
 import copy
 import io
@@ -23,7 +23,7 @@ from studies.simulation.truths import default_site
 from studies.validation import calibration, run_intervals, uncertainty
 from studies.validation.calibration import (
     GROUPS,
-    Aim,
+    Target,
     by_condition,
     checks,
     distribution,
@@ -37,10 +37,10 @@ from studies.validation.uncertainty import (
     HALF,
     SCENARIO_NOISE_UG,
     ValidationOutcome,
-    aims,
     control_checks,
     judged_checks,
     scenario_checks,
+    targets,
 )
 
 ELEMENTS = 7
@@ -100,11 +100,11 @@ def made_up(count: int, *, narrow: float = 1.0, shift: float = 0.0) -> list[dict
     return records
 
 
-def missed(found: list[Aim]) -> set[str]:
+def missed(found: list[Target]) -> set[str]:
     return {check.name for check in found if not check.is_met}
 
 
-def test_true_intervals_meet_all_aims() -> None:
+def test_true_intervals_meet_all_targets() -> None:
     assert missed(checks(made_up(200))) == set()
 
 
@@ -125,7 +125,7 @@ def test_estimates_to_one_side_show_in_the_ranks() -> None:
     assert "root mean square of z, ln EI" not in names  # which is why ranks are looked at
 
 
-def test_one_good_crossing_that_is_far_off_misses_its_aim() -> None:
+def test_one_good_crossing_that_is_far_off_misses_its_target() -> None:
     records = made_up(100)
     element = records[7]["estimates"]["EI_3"]
     for key in ("mean", "q025", "q50", "q975"):
@@ -135,7 +135,7 @@ def test_one_good_crossing_that_is_far_off_misses_its_aim() -> None:
     assert "largest |z| among good" not in missed(checks(records))
 
 
-def test_few_good_ones_miss_an_aim_and_rejected_ones_count() -> None:
+def test_few_good_ones_miss_a_target_and_rejected_ones_count() -> None:
     records = made_up(100)
     for line in records[:6]:
         line |= {"verdict": "rejected", "estimates": {}, "ranks": {}, "reasons": ["failed"]}
@@ -143,7 +143,7 @@ def test_few_good_ones_miss_an_aim_and_rejected_ones_count() -> None:
     assert scores(records).seeds.size == 94
 
 
-def test_nothing_to_measure_is_a_missed_aim() -> None:
+def test_nothing_to_measure_is_a_missed_target() -> None:
     records = [line | {"estimates": {}, "verdict": "rejected"} for line in made_up(5)]
     assert missed(checks(records)) == {"crossings with numbers"}
 
@@ -165,7 +165,7 @@ def test_what_is_declared_reaches_the_site_file(monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_allclose(site.sensor.noise_density_ug_per_rthz, 0.5 * density, rtol=1e-12)
 
 
-def test_a_control_that_nobody_notices_is_a_missed_aim() -> None:
+def test_a_control_that_stays_unnoticed_is_a_missed_target() -> None:
     records = made_up(20)
     assert len(missed(control_checks(records))) == 2
     seen = [line | {"verdict": "rejected", "reasons": ["model_misfit"]} for line in records]
@@ -258,12 +258,12 @@ def _outcome() -> ValidationOutcome:
     )
 
 
-def test_page_holds_every_aim_and_every_part() -> None:
+def test_page_holds_every_target_and_every_part() -> None:
     outcome = _outcome()
     page = validation_page(outcome)
     judged = [check.name for line in outcome.judged for check in judged_checks(line)]
     assert judged
-    for check in aims(outcome):
+    for check in targets(outcome):
         # What has a table of its own is listed only where it is missed.
         is_listed = check.name not in judged or not check.is_met
         assert (f"| {check.name.replace('|', chr(92) + '|')} |" in page) is is_listed
@@ -285,18 +285,18 @@ def test_page_counts_listed_and_unlisted_targets() -> None:
     assert "Met of them: d1 run 0: 4 of 4, d1 run 1: 3 of 4." in page
     missed_, all_ = re.search(r"(\d+) of (\d+) targets are missed", page).groups()  # type: ignore[union-attr]
     assert int(missed_) == page.count("| **missed** |")
-    assert int(all_) == listed + 4 + 3 == len(aims(outcome))
+    assert int(all_) == listed + 4 + 3 == len(targets(outcome))
     assert "Met of them" not in validation_page(outcome._replace(judged=[]))
 
 
-def test_a_missed_aim_stands_out_on_page_and_screen() -> None:
+def test_a_missed_target_stands_out_on_page_and_screen() -> None:
     outcome = _outcome()
     bad = copy.deepcopy(outcome.judged)
     bad[0]["verdict"] = "suspect"
     outcome = outcome._replace(judged=bad)
     assert "| d1 run 0: is good | 0 | 1 | **missed** |" in validation_page(outcome)
     out = io.StringIO()
-    print_outcome(Console(file=out, width=80), outcome, aims(outcome))
+    print_outcome(Console(file=out, width=80), outcome, targets(outcome))
     text = out.getvalue()
     assert "d1 run 0: is good" in text
     assert "MISSED" in text
@@ -321,7 +321,7 @@ def _options(truth: Path, processes: int) -> IntervalOptions:
 
 
 @pytest.mark.parametrize(("verdict", "code"), [("good", 0), ("suspect", 1)])
-def test_the_command_ends_with_1_where_an_aim_is_missed(
+def test_the_command_ends_with_1_where_a_target_is_missed(
     monkeypatch: pytest.MonkeyPatch, verdict: str, code: int
 ) -> None:
     """The hours of computing are left out: what they gave is made up."""

@@ -1,4 +1,4 @@
-"""Groups of a survey's crossings: which there are, what is counted as seen and as accused."""
+"""Groups of a survey's crossings: which there are, what is counted as seen and as falsely_named."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,12 @@ def test_groups_of_a_size_share_no_crossing_and_no_survey() -> None:
 def test_a_weak_element_is_seen_and_no_sound_one() -> None:
     found = groups_of([record("scenario-5", 0, n) for n in range(4)], bridge(), (2, 4))
     for line in detection.detection(found):
-        assert (line.named, line.below, line.accused, line.sound_below) == (1.0, 1.0, 0.0, 0.0)
+        assert (line.named, line.below, line.falsely_named, line.undamaged_below) == (
+            1.0,
+            1.0,
+            0.0,
+            0.0,
+        )
         assert line.loss is not None
         low, middle, high = line.loss
         assert 0.2 < low < middle < high < 0.4
@@ -62,13 +67,13 @@ def test_a_sound_element_that_is_called_weak_is_an_accusation() -> None:
     (line,) = detection.detection(
         groups_of([record("scenario-10", 0, n) for n in range(4)], bridge(), (4,))
     )
-    assert (line.named, line.below, line.accused) == (0.0, 0.0, 1.0)
-    assert line.sound_below == pytest.approx(1.0 / 6.0)
+    assert (line.named, line.below, line.falsely_named) == (0.0, 0.0, 1.0)
+    assert line.undamaged_below == pytest.approx(1.0 / 6.0)
     (sound,) = detection.detection(
         groups_of([record("scenario-1", 0, n) for n in range(4)], bridge(), (4,))
     )
     assert (sound.named, sound.below, sound.loss) == (None, None, None)
-    assert sound.accused == 1.0
+    assert sound.falsely_named == 1.0
     assert detection.cells(sound)[3:6] == ["–"] * 3
 
 

@@ -32,15 +32,17 @@ from services.common.options import (
 from services.simulation.effects import EFFECTS
 from services.simulation.survey_kinds import KINDS
 from services.simulation.validation_options import (
-    CertificateOptions,
     IntervalOptions,
     ScenarioOptions,
+    SiteValidationOptions,
     SurveyOptions,
 )
 
 _CHECKOUT: Final = Path(__file__).parents[3]
-_Options = TypeVar("_Options", CertificateOptions, ScenarioOptions, IntervalOptions, SurveyOptions)
-_OF_CERTIFICATES: Final = frozenset(field.name for field in fields(CertificateOptions))
+_Options = TypeVar(
+    "_Options", SiteValidationOptions, ScenarioOptions, IntervalOptions, SurveyOptions
+)
+_OF_SITE_VALIDATION: Final = frozenset(field.name for field in fields(SiteValidationOptions))
 _OF_METHODS: Final = frozenset(
     field.name
     for kind in (ScenarioOptions, IntervalOptions, SurveyOptions)
@@ -164,10 +166,10 @@ def _validate(asked: ValidateOptions) -> int:
     if asked.site is not None and asked.method is None:
         from services.cli.validate_site import validate_site_command
 
-        _refuse(asked, _OF_METHODS - _OF_CERTIFICATES, "only with --method")
+        _refuse(asked, _OF_METHODS - _OF_SITE_VALIDATION, "only with --method")
         asked = replace(asked, validations=validations_folder(asked.validations))
-        return validate_site_command(_of_kind(CertificateOptions, asked), a_console())
-    _refuse(asked, _OF_CERTIFICATES - _OF_METHODS, "only with --site, no --method")
+        return validate_site_command(_of_kind(SiteValidationOptions, asked), a_console())
+    _refuse(asked, _OF_SITE_VALIDATION - _OF_METHODS, "only with --site, no --method")
     code: int
     if asked.method == "pre" and asked.surveys:
         run_surveys = _study("validation.run_surveys")

@@ -11,9 +11,9 @@ from services.cli.commands import validate
 from services.simulation.effects import EFFECTS
 from services.simulation.survey_kinds import KINDS
 from services.simulation.validation_options import (
-    CertificateOptions,
     IntervalOptions,
     ScenarioOptions,
+    SiteValidationOptions,
     SurveyOptions,
 )
 
@@ -44,12 +44,12 @@ def options_of(kind: type) -> set[str]:
 
 
 def only_in_studies() -> list[str]:
-    names = set.union(*map(options_of, STUDIES)) - options_of(CertificateOptions)
+    names = set.union(*map(options_of, STUDIES)) - options_of(SiteValidationOptions)
     return sorted(f"--{name.replace('_', '-')}" for name in names)
 
 
 def test_every_option_belongs_to_a_kind_of_validation() -> None:
-    known = set.union(*map(options_of, (CertificateOptions, *STUDIES)))
+    known = set.union(*map(options_of, (SiteValidationOptions, *STUDIES)))
     assert set(vars(parsed())) - COMMON == known
 
 

@@ -12,7 +12,7 @@ from schemas.site import Vehicle
 from services.common.arrays import Floats
 from services.finding.placed import middle_names
 from services.identification.signal_checks import reasons_before_fit
-from services.simulation.drawn_tandem import TandemWorld, drawn_tandem
+from services.simulation.drawn_tandem import TandemEffects, drawn_tandem
 from services.simulation.survey_kinds import KINDS
 from services.simulation.wide_crossings import drive_case, site_of
 from studies.simulation.tandem_cases import draw_tandem
@@ -58,8 +58,8 @@ def test_body_that_pitches_is_judged_by_the_road(sign: float) -> None:
     kind = KINDS["tandem"]
     site = site_of_truck(default_site(), kind, 0)
     truth, seed = crossing_truth(site, kind, 13, 0, 0)
-    world = TandemWorld(kind.friction_share, kind.offset_m, wander_m=kind.wander_m)
-    run, _ = drawn_tandem(site, truth, seed, 13_000, world).recorded
+    effects = TandemEffects(kind.friction_share, kind.offset_m, wander_m=kind.wander_m)
+    run, _ = drawn_tandem(site, truth, seed, 13_000, effects).recorded
     signals = np.stack(list(run.channels.values()))
     signals[0] *= sign
     motion = steady(signals.shape[1], truth.conditions.speed_m_per_s, run.rate_hz)

@@ -36,11 +36,11 @@ from tests.identifications import identify_recordings
 BEFORE_S = 3.0
 
 
-def driven(beyond: OutOfModelEffects, site: Site | None = None) -> SimulatedDrive:
+def driven(effects: OutOfModelEffects, site: Site | None = None) -> SimulatedDrive:
     known = paper_site() if site is None else site
     sound = np.ones(known.bridges[0].elements)
     return simulate_drive(
-        known, sound, DrivenRoad("A", 1), Measurement(rate_hz=200.0), beyond=beyond
+        known, sound, DrivenRoad("A", 1), Measurement(rate_hz=200.0), effects=effects
     )
 
 
@@ -61,23 +61,23 @@ def differences(one: SimulatedDrive, other: SimulatedDrive) -> tuple[float, floa
 
 
 @pytest.mark.parametrize(
-    "beyond",
+    "effects",
     [
         OutOfModelEffects(support_rotational_stiffness_nm_per_rad=(5e8, 0.0)),
         OutOfModelEffects(support_compliance_m_per_n=(0.0, 3e-10)),
-        OutOfModelEffects(left=DepartedVehicle(3e5, 17.0, 0.1)),
+        OutOfModelEffects(departed=DepartedVehicle(3e5, 17.0, 0.1)),
     ],
 )
 def test_what_the_bridge_has_is_felt_on_the_bridge(
-    plain: SimulatedDrive, beyond: OutOfModelEffects
+    plain: SimulatedDrive, effects: OutOfModelEffects
 ) -> None:
-    before, after = differences(plain, driven(beyond))
+    before, after = differences(plain, driven(effects))
     assert before < 1e-6
     assert after > 2e-3
 
 
 @pytest.mark.parametrize(
-    "beyond",
+    "effects",
     [
         OutOfModelEffects(friction_share=0.05),
         OutOfModelEffects(bilinear_damping=0.2),
@@ -85,17 +85,17 @@ def test_what_the_bridge_has_is_felt_on_the_bridge(
     ],
 )
 def test_what_the_truck_has_is_felt_before_too(
-    plain: SimulatedDrive, beyond: OutOfModelEffects
+    plain: SimulatedDrive, effects: OutOfModelEffects
 ) -> None:
-    before, after = differences(plain, driven(beyond))
+    before, after = differences(plain, driven(effects))
     assert before > 1e-3
     assert after > 1e-3
 
 
 def test_a_lorry_the_other_way_or_long_ago_is_another_swing(plain: SimulatedDrive) -> None:
-    soon = driven(OutOfModelEffects(left=DepartedVehicle(3e5, 17.0, 0.1)))
-    back = driven(OutOfModelEffects(left=DepartedVehicle(3e5, -17.0, 0.1)))
-    late = driven(OutOfModelEffects(left=DepartedVehicle(3e5, 17.0, 100.0)))
+    soon = driven(OutOfModelEffects(departed=DepartedVehicle(3e5, 17.0, 0.1)))
+    back = driven(OutOfModelEffects(departed=DepartedVehicle(3e5, -17.0, 0.1)))
+    late = driven(OutOfModelEffects(departed=DepartedVehicle(3e5, 17.0, 100.0)))
     # On a symmetric bridge the odd modes swing alike, the even ones the other way round.
     assert differences(soon, back)[1] > 1e-4
     assert differences(plain, late)[1] < 1e-5

@@ -15,7 +15,7 @@ from services.common.geodesy import bridge_frame, to_chainage
 from services.execution.offline import site_of
 from services.finding.placed import middle_site
 from services.simulation.drawn import draw_truth, drive
-from services.simulation.drawn_tandem import TandemWorld, drawn_tandem, drawn_vehicle
+from services.simulation.drawn_tandem import TandemEffects, drawn_tandem, drawn_vehicle
 from services.simulation.drive_tandem import TandemDrive, tandem_case
 from services.simulation.two_sided import static_axle_loads_n
 from services.simulation.usual_trucks import usual_tandem
@@ -131,14 +131,14 @@ def test_drawn_crossing_has_the_errors_of_the_truth() -> None:
     truth = draw_truth(site, 5)
     how = truth.conditions._replace(rate_hz=200.0, speed_m_per_s=12.0, change_m_per_s=0.0)
     truth = truth._replace(conditions=how)
-    world = TandemWorld(friction_share=0.08, offset_m=0.02, outer_share=0.55, wander_m=0.0)
-    drawn = drawn_tandem(site, truth, 7, 1, world)
+    effects = TandemEffects(friction_share=0.08, offset_m=0.02, outer_share=0.55, wander_m=0.0)
+    drawn = drawn_tandem(site, truth, 7, 1, effects)
     case = drawn.case
     np.testing.assert_allclose(case.deck.flexural_rigidity_nm2, truth.beam.flexural_rigidity_nm2)
     assert [one.delay_s for one in case.sensors] == truth.channels.delay_s.tolist()
     assert (case.truck.axles[2].offset_m, case.truck.axles[2].outer_share) == (0.02, 0.55)
     assert case.truck.axles[1].friction_n > 0.0
-    assert drawn_tandem(site, truth, 7, 1, world).case == case
+    assert drawn_tandem(site, truth, 7, 1, effects).case == case
     run, declared = drawn.recorded
     assert run.rate_hz == 200.0
     assert {one.rate_hz for one in declared.vehicles[0].sensors} == {200.0}

@@ -25,13 +25,13 @@ from studies.simulation import out_of_model
 from studies.simulation.drive_wide import deck_with_width, truck_with_width
 from studies.simulation.out_of_model import OutOfModelTruth, draw_out_of_model
 from studies.simulation.truths import default_site
-from studies.validation import worlds as validation
-from studies.validation.worlds import (
+from studies.validation import misspecification as validation
+from studies.validation.misspecification import (
     append_record,
+    effect_checks,
     lines_of,
     read_records,
-    run_worlds,
-    world_checks,
+    run_effects,
 )
 
 SITE = default_site()
@@ -54,38 +54,38 @@ def within(values: Any, limits: tuple[float, float]) -> bool:
 
 
 def test_without_an_effect_the_world_is_the_methods() -> None:
-    for world in drawn("free")[:20]:
-        assert world.beyond == (((0.0, 0.0), (0.0, 0.0), None) + (0.0,) * 4 + (None,))
-        assert world.truth.beam.support_rotational_stiffness_nm_per_rad == (0.0, 0.0)
-        assert world.truth.car.tyre_damping_ns_per_m == (0.0, 0.0)
-        assert world.site == SITE
+    for case in drawn("free")[:20]:
+        assert case.effects == (((0.0, 0.0), (0.0, 0.0), None) + (0.0,) * 4 + (None,))
+        assert case.truth.beam.support_rotational_stiffness_nm_per_rad == (0.0, 0.0)
+        assert case.truth.car.tyre_damping_ns_per_m == (0.0, 0.0)
+        assert case.site == SITE
 
 
 @pytest.mark.parametrize("effect", ALONE)
 def test_an_effect_alone_changes_nothing_else(effect: str) -> None:
     """Truck, rigidities and drive of the seed are the same; of other effects there is none."""
     for seed in range(10):
-        plain, world = draw_out_of_model(SITE, "free", seed), draw_out_of_model(SITE, effect, seed)
-        assert draw_out_of_model(SITE, effect, seed).beyond == world.beyond
+        plain, case = draw_out_of_model(SITE, "free", seed), draw_out_of_model(SITE, effect, seed)
+        assert draw_out_of_model(SITE, effect, seed).effects == case.effects
         if effect != "spans":
             np.testing.assert_array_equal(
-                plain.truth.beam.flexural_rigidity_nm2, world.truth.beam.flexural_rigidity_nm2
+                plain.truth.beam.flexural_rigidity_nm2, case.truth.beam.flexural_rigidity_nm2
             )
-            assert plain.truth.car.body_mass_kg == world.truth.car.body_mass_kg
-            assert plain.truth.conditions.road_seed == world.truth.conditions.road_seed
+            assert plain.truth.car.body_mass_kg == case.truth.car.body_mass_kg
+            assert plain.truth.conditions.road_seed == case.truth.conditions.road_seed
         others = {
-            "sprung": any(world.beyond.support_rotational_stiffness_nm_per_rad),
-            "sinking": any(world.beyond.support_compliance_m_per_n),
-            "swing": world.truth.left is not None,
-            "tyres": any(world.truth.car.tyre_damping_ns_per_m),
-            "friction": any(world.truth.car.dry_friction_n),
-            "bilinear": world.truth.car.bilinear_damping > 0.0,
-            "air": world.truth.car.air_spring_exponent > 0.0,
-            "spans": bool(world.site.bridges[0].interior_supports_m),
-            "surface": world.truth.paths is not None and world.truth.paths.pavement == PLAIN,
-            "pavement": world.truth.paths is not None and world.truth.paths.pavement != PLAIN,
-            "torsion": world.width is not None and world.width.torsion is not None,
-            "left-and-right": world.width is not None and bool(world.width.sensors),
+            "sprung": any(case.effects.support_rotational_stiffness_nm_per_rad),
+            "sinking": any(case.effects.support_compliance_m_per_n),
+            "swing": case.truth.departed is not None,
+            "tyres": any(case.truth.car.tyre_damping_ns_per_m),
+            "friction": any(case.truth.car.dry_friction_n),
+            "bilinear": case.truth.car.bilinear_damping > 0.0,
+            "air": case.truth.car.air_spring_exponent > 0.0,
+            "spans": bool(case.site.bridges[0].interior_supports_m),
+            "surface": case.truth.paths is not None and case.truth.paths.pavement == PLAIN,
+            "pavement": case.truth.paths is not None and case.truth.paths.pavement != PLAIN,
+            "torsion": case.width is not None and case.width.torsion is not None,
+            "left-and-right": case.width is not None and bool(case.width.sensors),
         }
         assert [name for name, there in others.items() if there] == [effect] * (effect != "free")
 
@@ -97,11 +97,11 @@ def test_ranges_are_those_that_are_stated() -> None:
     compliance = np.array([w.truth.beam.support_compliance_m_per_n for w in drawn("sinking")])
     limits = np.log(out_of_model.BEARINGS_N_PER_M)
     assert within(-np.log(compliance), (float(limits[0]), float(limits[1])))
-    left = [w.truth.left for w in drawn("swing")]
-    assert within([one.weight_n / 9.80665 for one in left if one], out_of_model.LORRY_KG)
-    assert within([abs(one.speed_m_per_s) for one in left if one], out_of_model.LORRY_M_PER_S)
-    assert within([one.seconds for one in left if one], out_of_model.LEFT_S)
-    assert {one.speed_m_per_s > 0.0 for one in left if one} == {True, False}
+    departed = [w.truth.departed for w in drawn("swing")]
+    assert within([one.weight_n / 9.80665 for one in departed if one], out_of_model.LORRY_KG)
+    assert within([abs(one.speed_m_per_s) for one in departed if one], out_of_model.LORRY_M_PER_S)
+    assert within([one.seconds for one in departed if one], out_of_model.LEFT_S)
+    assert {one.speed_m_per_s > 0.0 for one in departed if one} == {True, False}
     tyres = [w.truth.car.tyre_damping_ns_per_m for w in drawn("tyres")]
     assert within(tyres, out_of_model.TYRE_DAMPING_NS_PER_M)
     cars = [w.truth.car for w in drawn("friction")]
@@ -110,7 +110,9 @@ def test_ranges_are_those_that_are_stated() -> None:
         carried = loads - 9.80665 * np.array(car.unsprung_mass_kg)
         shares = np.array(car.dry_friction_n) / carried
         assert shares[0] == pytest.approx(shares[1])
-    assert within([w.beyond.friction_share for w in drawn("friction")], out_of_model.FRICTION_SHARE)
+    assert within(
+        [w.effects.friction_share for w in drawn("friction")], out_of_model.FRICTION_SHARE
+    )
     assert within([car.friction_length_m for car in cars], out_of_model.FRICTION_LENGTH_M)
     assert {car.friction_load_growth for car in cars} == {0.0, 1.0}
     assert within([w.truth.car.bilinear_damping for w in drawn("bilinear")], out_of_model.BILINEAR)
@@ -135,7 +137,7 @@ def test_spans_are_continuous_bridges_from_the_same_start() -> None:
     bridges = [w.site.bridges[0] for w in drawn("spans")]
     assert {len(bridge.lengths_of_spans_m) for bridge in bridges} == {2, 3, 4, 5}
     assert within([length for b in bridges for length in b.lengths_of_spans_m], out_of_model.SPAN_M)
-    for world, bridge in zip(drawn("spans")[:20], bridges[:20], strict=True):
+    for case, bridge in zip(drawn("spans")[:20], bridges[:20], strict=True):
         assert bridge.ends_distance_m == pytest.approx(bridge.span_m, rel=1e-3)
         end = to_chainage(
             bridge_frame(SITE.bridges[0]),
@@ -144,19 +146,19 @@ def test_spans_are_continuous_bridges_from_the_same_start() -> None:
         )
         assert float(end[0][0]) == pytest.approx(bridge.span_m, abs=0.01)
         assert abs(float(end[1][0])) < 0.01
-        assert world.truth.beam.interior_supports == bridge.interior_support_nodes
-        assert world.truth.beam.element_lengths_m.sum() == pytest.approx(bridge.span_m)
+        assert case.truth.beam.interior_supports == bridge.interior_support_nodes
+        assert case.truth.beam.element_lengths_m.sum() == pytest.approx(bridge.span_m)
 
 
 def test_everything_is_all_of_it() -> None:
     found = drawn(EVERYTHING)
-    for world in found:
-        car, beam = world.truth.car, world.truth.beam
+    for case in found:
+        car, beam = case.truth.car, case.truth.beam
         assert all(car.tyre_damping_ns_per_m)
         assert all(car.dry_friction_n)
         assert all(beam.support_compliance_m_per_n)
-        assert world.truth.left is not None
-        assert world.truth.conditions.body_noise_ug_per_rthz is not None
+        assert case.truth.departed is not None
+        assert case.truth.conditions.body_noise_ug_per_rthz is not None
     springs = np.array([w.truth.beam.support_rotational_stiffness_nm_per_rad for w in found]) > 0.0
     assert 0.4 < springs.mean() < 0.6
     assert 0.4 < np.mean([bool(w.site.bridges[0].interior_supports_m) for w in found]) < 0.6
@@ -198,7 +200,7 @@ def test_the_surface_is_driven_over_by_the_worlds_truck(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(drawn_crossings, "measured_run", keeping)
     monkeypatch.setattr(validation, "identify_simulated", lambda runs, site, settings: [])
-    lines = [validation.one_world(SITE, effect, 2, SETTINGS) for effect in ("free", "surface")]
+    lines = [validation.one_effect(SITE, effect, 2, SETTINGS) for effect in ("free", "surface")]
     paths = draw_out_of_model(SITE, "surface", 2).truth.paths
     assert paths is not None
     assert reported == [None, paths]
@@ -209,11 +211,11 @@ def test_the_surface_is_driven_over_by_the_worlds_truck(monkeypatch: pytest.Monk
 
 def test_torsion_and_sides_are_drawn_from_the_stated_ranges() -> None:
     widths = [w.width for w in drawn("torsion")]
-    for world, width in zip(drawn("torsion"), widths, strict=True):
+    for case, width in zip(drawn("torsion"), widths, strict=True):
         assert width is not None
         assert width.torsion is not None
         assert width.paths.rear.twin_distance_m == 0.0
-        assert world.site.vehicles[0].twin_tyre_distance_m == (0.0, 0.0)
+        assert case.site.vehicles[0].twin_tyre_distance_m == (0.0, 0.0)
     lanes = [abs(width.lane_offset_m) for width in widths if width]
     assert within(lanes, out_of_model.LANE_OFFSET_M)
     assert {width.lane_offset_m > 0.0 for width in widths if width} == {True, False}
@@ -249,7 +251,7 @@ def test_torsion_reaches_the_simulation_and_the_record(monkeypatch: pytest.Monke
         return []
 
     monkeypatch.setattr(validation, "identify_simulated", keeping)
-    lines = [validation.one_world(SITE, effect, 2, SETTINGS) for effect in ON_SURFACES]
+    lines = [validation.one_effect(SITE, effect, 2, SETTINGS) for effect in ON_SURFACES]
     kept = [json.loads(json.dumps(line["world"]))["width"] for line in lines]
     assert kept[0] is None
     assert kept[1]["torsion"]["frequency_hz"] > 0.0
@@ -263,10 +265,10 @@ def test_torsion_reaches_the_simulation_and_the_record(monkeypatch: pytest.Monke
 
 
 def test_truck_with_width_has_loads_and_inertia_of_the_half_car() -> None:
-    world = draw_out_of_model(SITE, "torsion", 4)
-    width = world.width
+    case = draw_out_of_model(SITE, "torsion", 4)
+    width = case.width
     assert width is not None
-    car, beam = world.truth.car, world.truth.beam
+    car, beam = case.truth.car, case.truth.beam
     truck, deck = truck_with_width(car, width), deck_with_width(beam, width)
     np.testing.assert_allclose(
         static_loads(truck), static_axle_loads_n(car, STANDARD_GRAVITY), rtol=1e-9
@@ -337,7 +339,7 @@ def test_the_table_by_hand() -> None:
     (surface,) = lines_of([made_up("surface", 0, (0.0, 0.0)) | {"bound": bounds}])
     assert surface.over_bound == pytest.approx(0.5 * (0.05 / 0.04 + 0.05 / 0.025))
     assert air.coverage == 0.0
-    checks = {check.name: check for check in world_checks(records)}
+    checks = {check.name: check for check in effect_checks(records)}
     assert checks["swing: largest |z| among good"].is_met
     assert not checks["air: largest |z| among good"].is_met
     assert len(checks) == 2  # too few for coverage and mean
@@ -346,16 +348,16 @@ def test_the_table_by_hand() -> None:
 def test_enough_crossings_have_to_be_covered_and_centred() -> None:
     rng = np.random.default_rng(1)
 
-    def aims(shift: float, width: float) -> dict[str, bool]:
+    def targets(shift: float, width: float) -> dict[str, bool]:
         records = [
             made_up("sprung", seed, tuple(shift + width * rng.standard_normal(7)))
             for seed in range(100)
         ]
-        return {check.name: check.is_met for check in world_checks(records)}
+        return {check.name: check.is_met for check in effect_checks(records)}
 
-    assert all(aims(0.0, 1.0).values())
-    assert not aims(0.8, 1.0)["sprung: mean z of the worst element"]
-    assert not aims(0.0, 1.5)["sprung: coverage"]
+    assert all(targets(0.0, 1.0).values())
+    assert not targets(0.8, 1.0)["sprung: mean z of the worst element"]
+    assert not targets(0.0, 1.5)["sprung: coverage"]
 
 
 def test_bridges_of_different_numbers_of_elements_have_no_worst_element() -> None:
@@ -373,13 +375,13 @@ def test_what_is_there_is_not_run_again(tmp_path: Path, monkeypatch: pytest.Monk
         identity = validation.identity_of(site, settings)
         return made_up(effect, seed, (0.5,)) | {"identity": identity}
 
-    monkeypatch.setattr(validation, "one_world", quick)
-    run_worlds(SITE, ("swing",), 2, path, SETTINGS, 1)
+    monkeypatch.setattr(validation, "one_effect", quick)
+    run_effects(SITE, ("swing",), 2, path, SETTINGS, 1)
     assert ran == [("swing", 0), ("swing", 1)]
     # Killed in the middle of a line: that one is run again, and the next stands on its own line.
     path.write_bytes(path.read_bytes()[:-40])
     reported: list[tuple[int, int]] = []
-    found = run_worlds(
+    found = run_effects(
         SITE, ("swing", "air"), 2, path, SETTINGS, 1, lambda *counts: reported.append(counts)
     )
     assert ran[2:] == [("air", 0), ("swing", 1), ("air", 1)]
@@ -393,7 +395,7 @@ def test_what_is_there_is_not_run_again(tmp_path: Path, monkeypatch: pytest.Monk
     assert len(read_records(path)) == 4
     # Another site is another crossing.
     other = SITE.model_copy(update={"receiver": SITE.receiver.model_copy(update={"latency_s": 1})})
-    run_worlds(other, ("swing",), 1, path, SETTINGS, 1)
+    run_effects(other, ("swing",), 1, path, SETTINGS, 1)
     assert ran[5:] == [("swing", 0)]
 
 
@@ -420,6 +422,6 @@ def test_all_effects_at_once_leave_enough_draws() -> None:
 
     It then ended suspect with 10,000 draws; with other linear algebra it takes 2,000 to 2,400 now.
     """
-    line = validation.one_world(SITE, EVERYTHING, 7, SETTINGS)
+    line = validation.one_effect(SITE, EVERYTHING, 7, SETTINGS)
     assert line["verdict"] == "good", line["reasons"]
     assert line["diagnostics"]["draws"] <= 5_000

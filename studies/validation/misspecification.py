@@ -29,14 +29,16 @@ from services.simulation.effects import SURFACE
 from studies.simulation.drive_wide import Width
 from studies.simulation.out_of_model import draw_out_of_model, drive_out_of_model
 from studies.validation.bound import bound_at_truth
-from studies.validation.calibration import Aim, Record, in_processes, record
+from studies.validation.calibration import Record, Target, in_processes, record
 
 KeyT = TypeVar("KeyT")
 _COVERAGE = (0.93, 0.99)
 _LARGEST_MEAN_Z = 0.4
 _LARGEST_Z = 5.0
 _FEWEST = 48
-"""Fewest crossings of an effect whose statistics are aims; with fewer they are only shown."""
+"""Fewest crossings of an effect whose statistics are targets; with fewer they are only shown."""
+_KEYS = {"departed": "left"}
+"""Keys of records that differ from the names of fields: records of earlier runs stay readable."""
 
 
 class EffectSummary(NamedTuple):
@@ -65,11 +67,11 @@ class EffectSummary(NamedTuple):
     """Median of its ratio to the Cramér–Rao bound at the truth, with the mismatch in its noise."""
 
 
-def one_world(site: Site, effect: str, seed: int, settings: IdentificationSettings) -> Record:
+def one_effect(site: Site, effect: str, seed: int, settings: IdentificationSettings) -> Record:
     """Simulate, identify and judge one crossing; see `calibration.record`."""
-    world = draw_out_of_model(site, effect, seed)
-    left, paths = world.beyond.left, world.truth.paths
-    drawn = drive_out_of_model(world, seed)
+    case = draw_out_of_model(site, effect, seed)
+    departed, paths = case.effects.departed, case.truth.paths
+    drawn = drive_out_of_model(case, seed)
     found = identify_simulated([drawn.run], drawn.site, settings)
     seen = found[0] if len(found) == 1 else None
     # Only there does the truth contain noise that a model of one road lacks.
@@ -79,9 +81,9 @@ def one_world(site: Site, effect: str, seed: int, settings: IdentificationSettin
     return line | {
         "identity": identity_of(site, settings),
         "effect": effect,
-        "world": world.beyond._asdict()
+        "world": {_KEYS.get(name, name): value for name, value in case.effects._asdict().items()}
         | {
-            "left": None if left is None else left._asdict(),
+            "left": None if departed is None else departed._asdict(),
             "wheel_paths": None
             if paths is None
             else {
@@ -90,9 +92,9 @@ def one_world(site: Site, effect: str, seed: int, settings: IdentificationSettin
                 "wander_m": paths.wander_m,
                 "pavement": paths.pavement._asdict(),
             },
-            "width": None if world.width is None else _width_of(world.width),
-            "friction_length_m": world.truth.car.friction_length_m,
-            "interior_supports_m": world.site.bridges[0].interior_supports_m,
+            "width": None if case.width is None else _width_of(case.width),
+            "friction_length_m": case.truth.car.friction_length_m,
+            "interior_supports_m": case.site.bridges[0].interior_supports_m,
         },
         "derived": None if derived is None else derived.model_dump(mode="json"),
     }
@@ -122,7 +124,7 @@ def crossings_start(processes: int) -> str:
     return f"validating {{steps}} simulated crossings on {processes_in_words(processes)}"
 
 
-def run_worlds(
+def run_effects(
     site: Site,
     effects: Sequence[str],
     crossings: int,
@@ -144,7 +146,7 @@ def run_worlds(
         wanted,
         known,
         lambda line: (line["effect"], line["seed"]),
-        lambda key: partial(one_world, site, *key, settings),
+        lambda key: partial(one_effect, site, *key, settings),
         processes,
         progress,
     )
@@ -285,21 +287,23 @@ def _coverage(records: list[Record]) -> float | None:
     return float(np.mean(covered)) if covered else None
 
 
-def world_checks(records: Sequence[Record]) -> list[Aim]:
-    """Return the aims: no wrong good crossing; with enough of them true intervals and no bias."""
+def effect_checks(records: Sequence[Record]) -> list[Target]:
+    """Return the targets: no wrong good crossing; with enough of them coverage and no bias."""
     found = []
     for line in lines_of(records):
         if line.largest_z_good is not None:
             found.append(
-                Aim(f"{line.effect}: largest |z| among good", line.largest_z_good, 0.0, _LARGEST_Z)
+                Target(
+                    f"{line.effect}: largest |z| among good", line.largest_z_good, 0.0, _LARGEST_Z
+                )
             )
         if line.crossings >= _FEWEST:
-            found.append(Aim(f"{line.effect}: coverage", line.coverage, *_COVERAGE))
+            found.append(Target(f"{line.effect}: coverage", line.coverage, *_COVERAGE))
             is_pooled = line.worst_mean_z is None
             mean = line.mean_z if is_pooled else line.worst_mean_z
             size = None if mean is None else abs(mean)
             name = "mean z" if is_pooled else "mean z of the worst element"
-            found.append(Aim(f"{line.effect}: {name}", size, 0.0, _LARGEST_MEAN_Z))
+            found.append(Target(f"{line.effect}: {name}", size, 0.0, _LARGEST_MEAN_Z))
     return found
 
 
