@@ -26,7 +26,7 @@ class ParameterSpec(NamedTuple):
     """Owner of the parameter: TRUCK or BRIDGE."""
     key: str
     """Name of the quantity in `HalfCar`, `Beam` and the site file."""
-    which: int = 0
+    pair_index: int = 0
     """Index in a pair (front, rear) or (start, end)."""
     mass_power: int = 0
     """Power of the total mass to which the parameter is proportional for given accelerations: a
@@ -119,12 +119,12 @@ def table(elements: int, first_axle: int = 1) -> tuple[ParameterSpec, ...]:
     truck with a tandem, whose rows of springs, axles and tyres are then those of axles 2 and 3.
     """
     scalars = (
-        row._replace(name=f"{row.name[:-1]}{row.which + first_axle}")
+        row._replace(name=f"{row.name[:-1]}{row.pair_index + first_axle}")
         if row.key in (*PAIRS, *SPRINGS)
         else row
         for row in SCALARS
     )
-    rigidities = (ELEMENT._replace(name=f"EI_{e + 1}", which=e) for e in range(elements))
+    rigidities = (ELEMENT._replace(name=f"EI_{e + 1}", pair_index=e) for e in range(elements))
     return (*scalars, *rigidities)
 
 

@@ -80,7 +80,7 @@ class Buffers(NamedTuple):
     part: NDArray[np.int64]  # (wheels, n)
     corrected: FloatArray  # (4, 3, n): displacement, velocity, acceleration of each channel
     load: FloatArray  # (wheels, n): contact force on the bridge, up positive
-    sharp: FloatArray  # (wheels, n): the same, precompensated
+    precompensated: FloatArray  # (wheels, n): the same, precompensated
     road: FloatArray  # (2, n): deflection minus input profile
     body: FloatArray  # (2, n): residuals of the body equations
     begin: NDArray[np.int64]  # (rows,): see `residuals._locate_front_sample`, as the next

@@ -32,7 +32,7 @@ from pre_core.crossing.preparation import mismatch_gradient
 from pre_core.kernels.lanes import inner, kernel
 from pre_core.search.convergence import CHAINS
 
-_SETTLING = 500
+_BURN_IN = 500
 """Sweeps of burn-in before the first draw."""
 _SWEEPS = 60
 """Sweeps between two draws, because neighbouring elements are strongly correlated."""
@@ -95,11 +95,11 @@ def compliance_posterior(found: Optimum, inflation: float) -> CompliancePosterio
 
 
 def without_priors(
-    problem: PosteriorProblem, rows: int, places: NDArray[np.int64]
+    problem: PosteriorProblem, rows: int, indices: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return the indices (m,) of `rows` residuals but the priors of the coordinates `places`."""
+    """Return the indices (m,) of `rows` residuals but the priors of the coordinates `indices`."""
     # The priors' residuals come last, in the order of y up to the trajectory.
-    return np.setdiff1d(np.arange(rows), rows - layout(problem).trajectory.start + places)
+    return np.setdiff1d(np.arange(rows), rows - layout(problem).trajectory.start + indices)
 
 
 def to_compliance_coordinates(
@@ -224,7 +224,7 @@ def draws(
         posterior.sigma,
         posterior.inflation,
     )
-    _gibbs(density, start, _SETTLING if after is None else _SWEEPS, rng, sampled)
+    _gibbs(density, start, _BURN_IN if after is None else _SWEEPS, rng, sampled)
     x = sampled.copy()
     x[:, :e] = np.exp(-posterior.sigma * sampled[:, :e])
     mean = posterior.others_linear - x @ posterior.others_sampled.T
@@ -253,7 +253,7 @@ def never_absent(log_odds: FloatArray) -> FloatArray:
 def _gibbs(
     density: _SampledDensity,
     start: FloatArray,
-    settling: int,
+    burn_in: int,
     rng: np.random.Generator,
     out: FloatArray,
 ) -> None:
@@ -265,7 +265,7 @@ def _gibbs(
     x = start.copy()
     for i in range(e):
         x[i] = exp(-sigma[i] * y[i])
-    for sweep in range(settling + _SWEEPS * out.shape[0]):
+    for sweep in range(burn_in + _SWEEPS * out.shape[0]):
         for i in range(k):
             pull = linear[i]
             for j in range(k):
@@ -277,7 +277,7 @@ def _gibbs(
             else:
                 x[i] = _truncated_draw(rng, pull, precision[i, i], log_odds[i])
                 y[i] = x[i]
-        done = sweep - settling
+        done = sweep - burn_in
         if done >= 0 and done % _SWEEPS == _SWEEPS - 1:
             for i in range(k):
                 out[done // _SWEEPS, i] = y[i]

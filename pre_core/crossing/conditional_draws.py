@@ -23,7 +23,7 @@ from scipy.linalg import cho_solve, solve_triangular
 from pre_core.arrays import FloatArray
 from pre_core.crossing import compliances, posterior
 from pre_core.crossing.fit import Optimum
-from pre_core.crossing.nuisances import moved, place_of_offset, swing_effects
+from pre_core.crossing.nuisances import index_of_offset, moved, swing_effects
 from pre_core.crossing.posterior import PosteriorProblem
 from pre_core.crossing.residual_draws import (
     CompletedDraws,
@@ -115,7 +115,7 @@ def _partition(found: Optimum, inflation: float) -> _Partition:
             np.arange(where.delays.start, where.delays.stop),
         ]
     )
-    kept = np.append(curved, place_of_offset(problem))
+    kept = np.append(curved, index_of_offset(problem))
     swing = np.arange(where.swing.start, where.swing.stop)
     linear = np.setdiff1d(np.arange(state.y.size), np.concatenate([kept, swing]))
     rows = compliances.without_priors(problem, state.residual.size, curved)

@@ -85,7 +85,7 @@ def _apply_end_steps(
     (`end_share`). Call it after the wheel's force has been precompensated and softened.
     """
     n = work.part.shape[1]
-    load, sharp, part = work.load[w], work.sharp[w], work.part[w]
+    load, precompensated, part = work.load[w], work.precompensated[w], work.part[w]
     length = crossing.edges_m[crossing.edges_m.size - 1]
     values = np.empty(2 * _STEP_REACH + 2)
     for i in range(_STEP_REACH + 1, n - _STEP_REACH):
@@ -112,7 +112,7 @@ def _apply_end_steps(
         for m in range(2 * _STEP_REACH):
             j = begin + m
             before, at, after = values[m], values[m + 1], values[m + 2]
-            there = sharp[j] if part[j] >= 0 else 0.0
+            there = precompensated[j] if part[j] >= 0 else 0.0
             work.end_force[end, j] += at - (before - 2.0 * at + after) / 12.0 - there
             rising = low[m] + share * (high[m] - low[m])
             present = rising if is_on else 1.0 - rising
@@ -149,8 +149,8 @@ def add_deflection(
         work.end_share[:] = 0.0
         work.at_end[:] = False
     for w in range(work.part.shape[0]):
-        modal_response.precompensate_force(work.load[w], work.sharp[w])
-        _soften_ends(crossing, front, work.part[w], work.place[w], work.sharp[w])
+        modal_response.precompensate_force(work.load[w], work.precompensated[w])
+        _soften_ends(crossing, front, work.part[w], work.place[w], work.precompensated[w])
         if is_compliant:
             offset = 0.0 if w == 0 else -crossing.direction * points.wheelbase_m[k]
             if w == 2:
@@ -177,7 +177,7 @@ def add_deflection(
             stop += 1
         for w in range(work.part.shape[0]):
             for i in range(begin, stop):
-                p = work.sharp[w, i]
+                p = work.precompensated[w, i]
                 for lane in range(LANES):
                     work.force[w, i - begin, lane] = p
                     work.lanes[w, i - begin, lane] = 0.0

@@ -51,7 +51,7 @@ class FittedResiduals(NamedTuple):
 
     white: FloatArray
     """Residuals (m, 3): mismatch, front and rear body equation, of unit variance."""
-    stretch: NDArray[np.int64]
+    segment: NDArray[np.int64]
     """Label (m,) of residuals `BEFORE`, `ON` or `AFTER` the bridge."""
     step_s: float
     """Time between residuals."""

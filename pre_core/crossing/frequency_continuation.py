@@ -28,7 +28,7 @@ from pre_core.crossing.fit import (
     resting_mode_indices,
     tempered_residuals,
 )
-from pre_core.crossing.nuisances import place_of_offset
+from pre_core.crossing.nuisances import index_of_offset
 from pre_core.crossing.pavement import known_pavement
 from pre_core.crossing.posterior import PosteriorProblem, layout
 from pre_core.crossing.preparation import update_noise
@@ -69,7 +69,7 @@ class _Coordinates(NamedTuple):
     Elements are compliances relative to the nominal ones, rotational restraints y are y/(1 + y).
     """
 
-    places: NDArray[np.int64]  # (n,) indices in y
+    indices: NDArray[np.int64]  # (n,) indices in y
     elements: NDArray[np.int64]  # indices in u, as the next
     restraints: NDArray[np.int64]
     compliant: NDArray[np.int64]
@@ -110,10 +110,10 @@ def other_bridges(
     )  # fmt: skip
     at = _coordinates(problem)
     fit = _ContinuedFit(problem, y, strategy, at)
-    level = fit.objective(np.append(y[at.places], 0.0))
+    level = fit.objective(np.append(y[at.indices], 0.0))
     # With this noise the optimum's own bridge may lead to a better one, too.
     starts = [
-        (np.append(y[at.places], 0.0), ()),
+        (np.append(y[at.indices], 0.0), ()),
         *((one, _STAGES_HZ) for one in _starts(at, is_even=is_even)),
     ]
     tried = [fit.run(start, stages) for start, stages in starts]
@@ -124,11 +124,11 @@ def other_bridges(
 
 def distinct_bridges(found: Optimum, others: list[OtherBridge]) -> list[OtherBridge]:
     """Return the bridges that differ from an optimum's and from better ones, best first."""
-    places = [*layout(found.problem).bridge, place_of_offset(found.problem)]
-    known = [found.state.y[places]]
+    indices = [*layout(found.problem).bridge, index_of_offset(found.problem)]
+    known = [found.state.y[indices]]
     distinct = []
     for other in sorted(others, key=attrgetter("gain"), reverse=True):
-        bridge = other.y[places]
+        bridge = other.y[indices]
         if min(np.abs(bridge - one).max() for one in known) > _SAME_BRIDGE:
             known.append(bridge)
             distinct.append(other)
@@ -138,14 +138,14 @@ def distinct_bridges(found: Optimum, others: list[OtherBridge]) -> list[OtherBri
 def _coordinates(problem: PosteriorProblem) -> _Coordinates:
     where = layout(problem)
     kept = np.flatnonzero(problem.priors.estimated)
-    places = where.bridge
-    names = kept[places]
-    lower = np.full(places.size + 1, -np.inf)
-    lower[np.flatnonzero(np.isin(places, where.half_normal))] = 0.0
-    elements = np.flatnonzero(np.isin(places, where.elements))
+    indices = where.bridge
+    names = kept[indices]
+    lower = np.full(indices.size + 1, -np.inf)
+    lower[np.flatnonzero(np.isin(indices, where.half_normal))] = 0.0
+    elements = np.flatnonzero(np.isin(indices, where.elements))
     lower[elements] = _SMALLEST_COMPLIANCE
     return _Coordinates(
-        places,
+        indices,
         elements,
         np.flatnonzero(np.isin(names, (K_ROT, K_ROT + 1))),
         np.flatnonzero(np.isin(names, (F, F + 1))),
@@ -159,7 +159,7 @@ def _starts(at: _Coordinates, *, is_even: bool) -> Iterator[FloatArray]:
     ends = ((0.0, 0.0), (1.0, 1.0)) if is_even else ((1.0, 0.0), (0.0, 1.0))
     given = set()
     for restraints, compliances in product(ends, ends):
-        start = np.zeros(at.places.size + 1)
+        start = np.zeros(at.indices.size + 1)
         start[at.restraints] = restraints[: at.restraints.size]
         start[at.compliant] = compliances[: at.compliant.size]
         if start.tobytes() not in given:
@@ -181,14 +181,14 @@ class _ContinuedFit:
         self.evaluations = y.size + 1
         self._at, self._y, self._where = at, y, where
         # The offset moves the whole trajectory, whose other coordinates are relative to one.
-        offset = place_of_offset(problem)
-        held = np.concatenate([at.places, resting_mode_indices(problem, strategy), [offset]])
+        offset = index_of_offset(problem)
+        held = np.concatenate([at.indices, resting_mode_indices(problem, strategy), [offset]])
         self._others = others_effects(problem, y, held, 1.0)
-        directions = np.zeros((y.size, at.places.size + 1))
-        directions[at.places, np.arange(at.places.size)] = 1.0
+        directions = np.zeros((y.size, at.indices.size + 1))
+        directions[at.indices, np.arange(at.indices.size)] = 1.0
         directions[where.trajectory, -1] = 1.0
         without_bridge = y.copy()
-        without_bridge[at.places] = 0.0
+        without_bridge[at.indices] = 0.0
         self._rows = tempered_residuals(problem, without_bridge, directions, 1.0)
         self._data = problem.noise.reciprocal.size
         duration_s = self._data // RESIDUALS * problem.rows.every * problem.rows.step_s
@@ -206,7 +206,7 @@ class _ContinuedFit:
             u, _ = self._stage(u, up_to_hz, _STEPS)
         u, objective = self._stage(u, np.inf, _LAST_STEPS)
         y, moved = self._y.copy(), self._at.to_y(u)
-        y[self._at.places] = moved[:-1]
+        y[self._at.indices] = moved[:-1]
         y[self._where.trajectory] += moved[-1]
         return objective, y
 
@@ -226,6 +226,6 @@ class _ContinuedFit:
             low = dct(rows[:, : self._data : RESIDUALS], axis=1, norm="ortho")[:, :waves]
             return np.hstack([low, rows[:, self._data :]])
 
-        found = minimise(residuals, u, steps, ENOUGH, self._at.lower, is_followed=True)
+        found = minimise(residuals, u, steps, ENOUGH, self._at.lower, updates_jacobian=True)
         self.evaluations += evaluations_of(found)
         return found.state.y, found.state.objective

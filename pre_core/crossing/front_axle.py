@@ -88,15 +88,15 @@ def front_axle_response(problem: PosteriorProblem, y: FloatArray) -> FrontAxleRe
 
 
 def front_axle_power(
-    response: FrontAxleResponse, some: NDArray[np.int64]
+    response: FrontAxleResponse, segment: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
     """Return two expected tapered periodograms (f,) of the axle's noise in mismatch residuals.
 
-    They are of the successive residuals `some` (m,), see `tapered_periodogram`. The first is
+    They are of the successive residuals `segment` (m,), see `tapered_periodogram`. The first is
     caused by a surface on the bridge as rough as off it, the second by errors of the axle's values.
     """
-    taper = hann_taper(some.size)[:, None]
-    of_knots = np.fft.rfft(taper * response.columns[0, some], axis=0)[1:]
+    taper = hann_taper(segment.size)[:, None]
+    of_knots = np.fft.rfft(taper * response.columns[0, segment], axis=0)[1:]
     by_surface, by_values = (
         np.einsum("fk,kl,fl->f", of_knots, covariance, of_knots.conj(), optimize=True).real
         for covariance in (response.covariance, response.of_values)

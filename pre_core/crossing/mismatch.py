@@ -161,7 +161,7 @@ def between_run_spectra(front: Footprint, rear: Footprint, wander_m: float) -> F
 def with_axle_roll(shapes: MismatchSpectra, hop_hz: float, speed_m_per_s: float) -> MismatchSpectra:
     """Return the spectra with one more for each band in which the axles may roll at a speed.
 
-    A sensor beside the middle of its axle reads a part of the roll, by which an offset's spectrum
+    A sensor off the middle of its axle reads a part of the roll, by which an offset's spectrum
     rises at the axle's roll resonance, `_ROLL_BANDS` relative to the frequency `hop_hz` of its mass
     on its tyres. A band is a hat function of the logarithm of the frequency.
     """
@@ -331,7 +331,7 @@ def correlation_time_s(mismatch: Mismatch) -> float:
 class PeriodogramSegment(NamedTuple):
     """Periodogram of a segment of residuals, and its expectation by source."""
 
-    seen: FloatArray  # (f,): periodogram
+    observed: FloatArray  # (f,): periodogram
     sensors: FloatArray  # (f,): expectation from sensor noise
     shapes: FloatArray  # (s, f): expectation from each shape of unit level
 
@@ -352,7 +352,7 @@ def tapered_periodogram(
     """
     m = values.size
     taper = hann_taper(m)
-    seen = np.abs(np.fft.rfft(taper * values)[1:]) ** 2
+    observed = np.abs(np.fft.rfft(taper * values)[1:]) ** 2
     size = 2 * m
     # Overlap of the taper with itself, lag by lag.
     overlap = np.fft.irfft(np.abs(np.fft.rfft(taper, size)) ** 2, size)[:m]
@@ -366,7 +366,9 @@ def tapered_periodogram(
         # Only rounding makes a zero negative.
         return np.maximum(power, _NOTHING * power.max())
 
-    return PeriodogramSegment(seen, expected(sensors), np.stack([expected(row) for row in shapes]))
+    return PeriodogramSegment(
+        observed, expected(sensors), np.stack([expected(row) for row in shapes])
+    )
 
 
 def surface_level(
@@ -379,10 +381,10 @@ def surface_level(
     """
     found = []
     for one, length in zip(roads, lengths_m, strict=True):
-        n = np.arange(1, one.seen.size + 1) / length
+        n = np.arange(1, one.observed.size + 1) / length
         inside = (n > _SURFACE_CYCLES_PER_M[0]) & (n < _SURFACE_CYCLES_PER_M[1])
         spread = np.interp(n[inside], shapes.cycles_per_m, shapes.road_spread)
-        found.append(one.seen[inside] / one.shapes[0, inside] * spread)
+        found.append(one.observed[inside] / one.shapes[0, inside] * spread)
     ratio = np.concatenate(found)
     # The median of an exponential is ln 2 times its mean.
     return float(np.median(ratio) / np.log(2.0)) if ratio.size else 0.0
@@ -411,8 +413,8 @@ def estimate_levels(
 def _most_likely_levels(
     segments: list[PeriodogramSegment], typical: FloatArray
 ) -> tuple[FloatArray, float]:
-    seen = np.concatenate([one.seen for one in segments])
+    observed = np.concatenate([one.observed for one in segments])
     known = np.concatenate([one.sensors for one in segments])
     shape = np.concatenate([one.shapes for one in segments], axis=1)
-    start = np.full(shape.shape[0], np.mean(seen) / np.mean(shape.sum(axis=0)))
-    return maximum_likelihood_levels(seen, known, shape, start, 2.0 / typical, _ENOUGH)
+    start = np.full(shape.shape[0], np.mean(observed) / np.mean(shape.sum(axis=0)))
+    return maximum_likelihood_levels(observed, known, shape, start, 2.0 / typical, _ENOUGH)

@@ -180,13 +180,13 @@ def noise_spectrum(
     truck: NoisePath,
     density: FloatArray,
     force: FloatArray,
-    road: Mismatch | None,
+    mismatch: Mismatch | None,
     omega: FloatArray,
 ) -> NDArray[np.complex128]:
     """Return one-sided spectra of the residuals' noise as accelerations: (3, 3, f).
 
     `force` (2, shapes) in N²/Hz are the levels of suspension noise, multiplied by
-    `REDUCED_WEIGHT_FACTOR` for the body equations; `road` is the mismatch, `omega` (f,).
+    `REDUCED_WEIGHT_FACTOR` for the body equations; `omega` is (f,).
     """
     responses = _responses(truck, omega)
     sources = np.concatenate([density, density[[1, 0, 3, 2]]])[: responses.shape[1]]
@@ -206,8 +206,8 @@ def noise_spectrum(
         )
     elif force.any():
         spectrum[[1, 2], [1, 2]] += _suspension_noise_spectra(truck, force, omega)
-    if road is not None:
-        spectrum[0, 0] += omega**4 * _mismatch.spectrum(road, omega)
+    if mismatch is not None:
+        spectrum[0, 0] += omega**4 * _mismatch.spectrum(mismatch, omega)
     return spectrum
 
 
@@ -253,12 +253,12 @@ def folded_spectrum(
     truck: NoisePath,
     density: FloatArray,
     force: FloatArray,
-    road: Mismatch | None,
+    mismatch: Mismatch | None,
 ) -> NDArray[np.complex128]:
     """Return `noise_spectrum` of the filtered residuals (f, 3, 3), including aliases."""
     both = np.concatenate([at.below, at.above])
     power = np.concatenate([at.power_below, at.power_above])
-    whole = noise_spectrum(truck, density, force, road, both) * power
+    whole = noise_spectrum(truck, density, force, mismatch, both) * power
     low, high = np.split(whole, 2, axis=2)
     return np.moveaxis(low + high.conj(), 2, 0)
 
@@ -269,7 +269,7 @@ def noise_power(
     density: FloatArray,
     force: FloatArray,
     which: list[int],
-    road: Mismatch | None = None,
+    mismatch: Mismatch | None = None,
 ) -> FloatArray:
     """Return tr(C_0^-1 C) per residual sample for other trucks, minus that of the first: (w,).
 
@@ -277,7 +277,9 @@ def noise_power(
     4), `force` (2, shapes). The spectra are those of an endless record of residuals, aliased at
     half their rate.
     """
-    spectrum = partial(folded_spectrum, folded(rows, _FEW_FREQUENCIES), force=force, road=road)
+    spectrum = partial(
+        folded_spectrum, folded(rows, _FEW_FREQUENCIES), force=force, mismatch=mismatch
+    )
     first = np.linalg.inv(spectrum(trucks[0], density[0]))
     traces = [
         np.einsum("fij,fji->", first, spectrum(trucks[1 + k], density[1 + k])).real for k in which
@@ -289,8 +291,8 @@ def mismatch_levels(
     rows: RowFilter,
     truck: NoisePath,
     density: FloatArray,
-    road: Mismatch,
-    stretches: list[FloatArray],
+    mismatch: Mismatch,
+    segments: list[FloatArray],
     roads: list[FloatArray],
     *,
     has_only_offset: bool = False,
@@ -304,20 +306,20 @@ def mismatch_levels(
     Each segment (m,) has consecutive filtered residuals unaffected by a bridge; `roads` are
     residuals of one axle's profile there, treated as the front one, which bound an axle's offset.
     """
-    omega, shapes = rows.omega, road.shapes
+    omega, shapes = rows.omega, mismatch.shapes
     table = np.concatenate([_mismatch.unwindowed(shapes), shapes.road[None, :]])
     sensors = noise_spectrum(truck, density, no_suspension_noise(), None, omega)[0, 0].real
-    spectra = np.vstack([sensors, omega**4 * _mismatch.density_at(road, omega, table)])
-    longest = max(stretch.size for stretch in stretches)
+    spectra = np.vstack([sensors, omega**4 * _mismatch.density_at(mismatch, omega, table)])
+    longest = max(segment.size for segment in segments)
     covariances = autocovariances(rows, spectra, longest)
     of_sensors, of_shapes = covariances[0], covariances[1:]
     whole = [_mismatch.tapered_periodogram(one, of_sensors, of_shapes[-1:]) for one in roads]
-    metres = rows.every * rows.step_s * road.speed_m_per_s
+    metres = rows.every * rows.step_s * mismatch.speed_m_per_s
     surface = _mismatch.surface_level(shapes, whole, [metres * one.size for one in roads])
     expected = surface * shapes.expected_m
     bands = expected.size - _mismatch.TRACK_SHAPES
     usual = np.append([np.inf, expected[1]], np.full(bands, np.inf))
-    parts = [_mismatch.tapered_periodogram(one, of_sensors, of_shapes[:-1]) for one in stretches]
+    parts = [_mismatch.tapered_periodogram(one, of_sensors, of_shapes[:-1]) for one in segments]
     if not has_only_offset:
         level, statistic = _mismatch.estimate_levels(parts, usual, bands)
         if level[0] >= _EQUAL_TYRES * expected[0]:
@@ -344,9 +346,9 @@ def suspension_noise_levels(
     levels = no_suspension_noise()
     for axle in range(2):
         shape = shapes / over[axle] ** 2
-        seen, known = shown[axle], sensors[axle]
-        level = np.full(FORCE_SHAPES, seen.mean()) / shape.mean(axis=1)
-        level, statistic = maximum_likelihood_levels(seen, known, shape, level)
+        observed, known = shown[axle], sensors[axle]
+        level = np.full(FORCE_SHAPES, observed.mean()) / shape.mean(axis=1)
+        level, statistic = maximum_likelihood_levels(observed, known, shape, level)
         if statistic > friction_statistic:
             levels[axle] = level
     return levels

@@ -86,7 +86,7 @@ class Nuisances(NamedTuple):
         return self.basis.shape[1] - self.own.size
 
 
-def place_of_offset(problem: PosteriorProblem) -> int:
+def index_of_offset(problem: PosteriorProblem) -> int:
     """Return the index in y of the coefficient that stands for the whole trajectory's offset."""
     where = posterior.layout(problem)
     return (where.trajectory.start + where.trajectory.stop) // 2
@@ -111,7 +111,7 @@ def nuisances_of(
     y[swing] = 0.0
     jacobian = jacobian[parts.rows]
     # The whole trajectory follows one coefficient, and its other coordinates are relative to it.
-    kept = np.append(parts.curved, place_of_offset(problem))
+    kept = np.append(parts.curved, index_of_offset(problem))
     jacobian[:, kept[-1]] = jacobian[:, where.trajectory].sum(axis=1)
     own = np.setdiff1d(np.arange(y.size), np.concatenate([kept, parts.linear, swing]))
     swinging = np.repeat(y[None, :], min(_SWINGING, drawn.shape[0]), axis=0)

@@ -64,38 +64,38 @@ def estimate_pavement(
     """
     inside = _distance_inside_m(problem, y)
     share = _share_on_bridge(inside)
-    road = problem.mismatch._replace(level_m3=level_m3)
+    mismatch = problem.mismatch._replace(level_m3=level_m3)
     rows = problem.rows
-    half_m = 0.5 * rows.taps.size * rows.step_s * road.speed_m_per_s
+    half_m = 0.5 * rows.taps.size * rows.step_s * mismatch.speed_m_per_s
     middle = np.flatnonzero(inside > half_m + _JOINT_M)
     if middle.size < FEWEST_ROWS:
         prior = np.diag([RATIO_SPREAD**2, TILT_SPREAD**2])
         return BridgePavement(np.zeros(2), prior, share)
-    part = _periodogram(problem, y, road, middle)
+    part = _periodogram(problem, y, mismatch, middle)
     known, shape = part.sensors, part.shapes[0]
     if front_axle is not None:
         by_surface, by_values = front_axle_power(front_axle, middle)
         known, shape = known + by_values, shape + by_surface
-    length_m = middle.size * (rows.every * rows.step_s) * road.speed_m_per_s
-    n = np.arange(1, part.seen.size + 1) / length_m
+    length_m = middle.size * (rows.every * rows.step_s) * mismatch.speed_m_per_s
+    n = np.arange(1, part.observed.size + 1) / length_m
     low, high = _SHORT_CYCLES_PER_M
     short = (n > low) & (n < high)
-    found, covariance = fit_ratio(part.seen[short], known[short], shape[short], n[short])
+    found, covariance = fit_ratio(part.observed[short], known[short], shape[short], n[short])
     return BridgePavement(found, covariance, share)
 
 
 def _periodogram(
-    problem: PosteriorProblem, y: FloatArray, road: Mismatch, some: NDArray[np.int64]
+    problem: PosteriorProblem, y: FloatArray, mismatch: Mismatch, segment: NDArray[np.int64]
 ) -> PeriodogramSegment:
-    """Return the periodogram of successive residuals `some` (m,), with its expectation."""
+    """Return the periodogram of successive residuals `segment` (m,), with its expectation."""
     rows, omega = problem.rows, problem.rows.omega
-    table = _mismatch.unwindowed(road.shapes)
-    density = omega**4 * (road.level_m3 @ _mismatch.density_at(road, omega, table))
+    table = _mismatch.unwindowed(mismatch.shapes)
+    density = omega**4 * (mismatch.level_m3 @ _mismatch.density_at(mismatch, omega, table))
     truck, sensor = noise_path_at(problem, y)
     of_sensors = noise_spectrum(truck, sensor, no_suspension_noise(), None, omega)[0, 0].real
-    covariances = autocovariances(rows, np.stack([of_sensors, density]), some.size)
+    covariances = autocovariances(rows, np.stack([of_sensors, density]), segment.size)
     return _mismatch.tapered_periodogram(
-        filtered_rows(problem, y)[0, some], covariances[0], covariances[1:]
+        filtered_rows(problem, y)[0, segment], covariances[0], covariances[1:]
     )
 
 
@@ -116,7 +116,7 @@ def _share_on_bridge(inside_m: FloatArray) -> FloatArray:
 
 
 def fit_ratio(
-    seen: FloatArray, known: FloatArray, shape: FloatArray, cycles_per_m: FloatArray
+    observed: FloatArray, known: FloatArray, shape: FloatArray, cycles_per_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return (r, t) and their covariance (2, 2) from a tapered periodogram (f,).
 
@@ -132,7 +132,7 @@ def fit_ratio(
         of_mismatch = shape * np.exp(2.0 * columns @ found)
         expected = known + of_mismatch
         relative = 2.0 * (of_mismatch / expected)[:, None] * columns
-        gradient = 0.5 * relative.T @ (1.0 - seen / expected) + prior @ found
+        gradient = 0.5 * relative.T @ (1.0 - observed / expected) + prior @ found
         information = 0.5 * relative.T @ relative + prior
         step = np.linalg.solve(information, gradient)
         step *= min(1.0, _LONGEST_STEP / max(float(np.abs(step).max()), _CONVERGED))
@@ -151,15 +151,15 @@ class RoadPart(NamedTuple):
     is_bridge: bool
 
 
-def parts_of(road: Mismatch, count: int) -> list[RoadPart]:
+def parts_of(mismatch: Mismatch, count: int) -> list[RoadPart]:
     """Return the parts off and on the bridge of `count` residuals; one if both are alike."""
-    pavement = road.pavement
+    pavement = mismatch.pavement
     if pavement is None:
-        return [RoadPart(road, float(count), False)]
+        return [RoadPart(mismatch, float(count), False)]
     on = float(pavement.share.sum())
     return [
-        RoadPart(road._replace(pavement=None), count - on, False),
-        RoadPart(_mismatch.on_bridge(road), on, True),
+        RoadPart(mismatch._replace(pavement=None), count - on, False),
+        RoadPart(_mismatch.on_bridge(mismatch), on, True),
     ]
 
 

@@ -113,7 +113,8 @@ def residual_draws(
 ) -> WeightedDraws:
     """Return weighted draws (k, d) or (k, f), in rounds of n, the number of `first` points (n, d).
 
-    Rounds end as soon as all draws are worth `draws` (`is_enough`), after `rounds` at the latest.
+    Rounds end as soon as the effective size of all draws suffices for `draws` (`is_enough`), after
+    `rounds` at the latest.
     """
     residuals = _residuals(density, first)
     level = float(log_density(density, first, np.sum(residuals**2, axis=0)).max())
@@ -126,7 +127,7 @@ def residual_draws(
         new = _draws_on(density, used[-1], first.shape[0], rng)
         batches.append(_drawn(density, frame, new))
         weighted = _weighted(density, used, batches[1:])
-        if is_enough(weighted.worth, draws) or len(used) == rounds:
+        if is_enough(weighted.weights, draws) or len(used) == rounds:
             return weighted
 
 

@@ -101,7 +101,7 @@ def _wheels(
             load[i] = sign * transfer * speeding[i] - weight - inertial - m_u * a_u[i]
         # The tyre force accelerates the masses above it, whatever springs are between; where these
         # are linear, they give the same with far less noise of the body sensors.
-        force = work.sharp[w]  # written later, by `precompensate_force`
+        force = work.precompensated[w]  # written later, by `precompensate_force`
         if crossing.is_inertial:
             for i in range(n):
                 force[i] = -load[i] - weight
@@ -225,10 +225,10 @@ def _evaluate(
     work: Buffers,
     points: EvaluationPoints,
     part: tuple[int, int],
-    what: int,
+    output: int,
     out: FloatArray,
 ) -> None:
-    """Write the output `what` of points `part[0]` to `part[1]` to `out`, NaN for impossible ones.
+    """Write the `output` of points `part[0]` to `part[1]` to `out`, NaN for impossible ones.
 
     One kernel serves all three outputs: three kernels would each contain a copy of the model and
     take as long to load.
@@ -243,7 +243,7 @@ def _evaluate(
             row[:] = np.nan
             continue
         road = work.road.reshape(work.road.size)
-        if what == _DEFLECTIONS:
+        if output == _DEFLECTIONS:
             for i in range(row.size):
                 row[i] = road[i]
         elif not _locate_front_sample(
@@ -252,12 +252,12 @@ def _evaluate(
             row[:] = np.nan
             continue
         add_deflection(crossing, work, points, k)
-        if what == _DEFLECTIONS:
+        if output == _DEFLECTIONS:
             for i in range(row.size):
                 row[i] = road[i] - row[i]
             continue
         _compare(crossing, work, work.residual)
-        if what == _PLAIN:
+        if output == _PLAIN:
             residual = work.residual.reshape(work.residual.size)
             for i in range(row.size):
                 row[i] = residual[i]

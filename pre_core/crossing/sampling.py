@@ -125,10 +125,10 @@ def _single_profile_draws(
 ) -> PosteriorDraws:
     weighted = surrogate_draws(found, draws, seed, inflation, report)
     evaluations = weighted.y.shape[0]
-    if not is_enough(weighted.worth, draws):
+    if not is_enough(weighted.weights, draws):
         other = conditional_draws(found, draws, seed, inflation, report)
         evaluations += other.evaluations
-        weighted = max(weighted, other.weighted, key=lambda one: one.worth.ess)
+        weighted = max(weighted, other.weighted, key=lambda one: one.weights.ess)
     chains = _resample_to_chains(weighted, _monitored_indices(found.problem), draws, seed)
     return chains._replace(evaluations=evaluations)
 
@@ -153,18 +153,18 @@ def _resample_to_chains(
 ) -> PosteriorDraws:
     """Return weighted draws resampled by their weights, in the form of chains."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 22,)))
-    y, worth = weighted
+    y, weights = weighted
     count = -(-max(draws, y.shape[0]) // convergence.CHAINS)
-    chosen = importance.systematic_resample(worth.weight, count * convergence.CHAINS, rng)
+    chosen = importance.systematic_resample(weights.weight, count * convergence.CHAINS, rng)
     dealt = y[chosen].reshape(count, convergence.CHAINS, -1)
     return PosteriorDraws(
         dealt,
         float(convergence.split_r_hat(dealt[:, :, monitored]).max()),
-        worth.ess,
-        worth.ess / y.shape[0],
+        weights.ess,
+        weights.ess / y.shape[0],
         y.shape[0],
-        Termination.STEPS_DONE if is_enough(worth, draws) else Termination.STEPS_EXHAUSTED,
-        worth.pareto_k,
+        Termination.STEPS_DONE if is_enough(weights, draws) else Termination.STEPS_EXHAUSTED,
+        weights.pareto_k,
     )
 
 
@@ -180,7 +180,7 @@ def _mismatch_draws(
         return _alike_tyres_draws(found, draws, seed, inflation, report)
     of = surface_posterior(found, inflation, seed)
     weighted = draw_curved(found, of.squares, draws, seed, inflation, report)
-    if is_enough(weighted.worth, draws):
+    if is_enough(weighted.weights, draws):
         chains = _completed_to_chains(found, weighted, draws, seed, inflation)
     else:
         chains = _compliance_draws(found, draws, seed, inflation)
@@ -196,12 +196,12 @@ def _alike_tyres_draws(
     if hardly any are effective.
     """
     weighted, evaluations, points = drawn_by_residuals(found, draws, seed, inflation, report)
-    if weighted.worth.ess < _LEAST_ESS:
+    if weighted.weights.ess < _LEAST_ESS:
         # Diagnostics are of the draws that failed, not of those in their place.
         chains = _compliance_draws(found, draws, seed, inflation)._replace(
-            ess=weighted.worth.ess,
-            acceptance=weighted.worth.ess / weighted.y.shape[0],
-            pareto_k=weighted.worth.pareto_k,
+            ess=weighted.weights.ess,
+            acceptance=weighted.weights.ess / weighted.y.shape[0],
+            pareto_k=weighted.weights.pareto_k,
             ending=Termination.STEPS_EXHAUSTED,
         )
     else:
@@ -218,7 +218,7 @@ def _completed_to_chains(
     drawn += compliances.MISMATCH_BIAS_SPREAD * np.outer(
         rng.standard_normal(drawn.shape[0]), compliances.mismatch_bias(found)
     )
-    of_all = WeightedDraws(drawn, weighted.worth)
+    of_all = WeightedDraws(drawn, weighted.weights)
     return _resample_to_chains(of_all, _monitored_indices(found.problem), draws, seed)
 
 

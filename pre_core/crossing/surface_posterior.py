@@ -25,9 +25,9 @@ from pre_core.crossing.nuisances import (
     Nuisances,
     ResidualParts,
     followed,
+    index_of_offset,
     integrated_residuals,
     nuisances_of,
-    place_of_offset,
 )
 from pre_core.crossing.residual_draws import (
     DrawnDensity,
@@ -174,12 +174,12 @@ def surface_posterior(found: Optimum, inflation: float, seed: int) -> SurfacePos
     widened = _WIDENED * inflation
     first = fitted(_points_of_normal(found, _FIRST_POINTS, widened, seed))
     wide = draw_curved(found, first.squares, POINTS, seed, widened, may_be_absent=False)
-    if not is_enough(wide.worth, POINTS):
+    if not is_enough(wide.weights, POINTS):
         return first._replace(points=_points_of_normal(found, POINTS, widened, seed))
     # Points that crossings have in common would have errors that add up in fusion.
     own = (1 << 23, found.problem.noise.reciprocal.size)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=own))
-    resampled = wide.y[importance.systematic_resample(wide.worth.weight, POINTS, rng)]
+    resampled = wide.y[importance.systematic_resample(wide.weights.weight, POINTS, rng)]
     points = copula_draws(resampled, POINTS, rng)
     second = fitted(points[:POINTS_OF_DRAWS])
     return second._replace(points=points, evaluations=first.evaluations + second.evaluations)
@@ -187,7 +187,7 @@ def surface_posterior(found: Optimum, inflation: float, seed: int) -> SurfacePos
 
 def _points_of_normal(found: Optimum, count: int, inflation: float, seed: int) -> FloatArray:
     """Return at least `count` points (k, n + 1) of the normal in c about the optimum."""
-    kept = np.append(curved_coordinates(found), place_of_offset(found.problem))
+    kept = np.append(curved_coordinates(found), index_of_offset(found.problem))
     return compliances.present_points(found, count, inflation, seed)[:, kept]
 
 
@@ -221,7 +221,7 @@ def draw_curved(
     curved coordinates. Unless they `may_be_absent`, restraint and bearing compliance are present in
     all draws.
     """
-    kept = np.append(curved_coordinates(found), place_of_offset(found.problem))
+    kept = np.append(curved_coordinates(found), index_of_offset(found.problem))
     centres = prior_centres(found, kept[:-1])
 
     def target(y: FloatArray) -> FloatArray:
@@ -245,7 +245,7 @@ def complete(
 ) -> FloatArray:
     """Return y (k, f): curved coordinates and offset `drawn` (k, n + 1), all others drawn here."""
     y, jacobian = found.state.y, found.state.jacobian
-    kept = np.append(curved_coordinates(found), place_of_offset(found.problem))
+    kept = np.append(curved_coordinates(found), index_of_offset(found.problem))
     others = np.setdiff1d(np.arange(y.size), kept)
     root = cholesky(jacobian[:, others].T @ jacobian[:, others])
 

@@ -79,7 +79,7 @@ def wheels(
         m_u, k_u = theta[M_U1 + w], theta[K_U1 + w]
         z_u, a_u = work.corrected[2 + w, 0], work.corrected[2 + w, 2]
         static = weight * (share * on.bogie_kg + m_u)
-        road, of_wheel, force = work.road[w], work.load[w], work.sharp[w]
+        road, of_wheel, force = work.road[w], work.load[w], work.precompensated[w]
         soft = 1.0 / k_u
         for i in range(n):
             force[i] += m_u * a_u[i]
@@ -99,10 +99,13 @@ def _shared_force(
     transfer: float,
     speeding: FloatArray,
 ) -> None:
-    """Write the axles' shares of the spring force to `sharp`, minus the front one to `load`."""
+    """Write the axles' shares of the spring force, and minus the front axle's force to `load`.
+
+    The shares are in `precompensated` until the loads are precompensated.
+    """
     on = shared_load(crossing.lead, theta, crossing.total_mass_kg, gap)
     a_1, a_2 = work.corrected[0, 2], work.corrected[1, 2]
-    of_lead, first, second = work.load[2], work.sharp[0], work.sharp[1]
+    of_lead, first, second = work.load[2], work.precompensated[0], work.precompensated[1]
     share = theta[SHARE]
     rest = 1.0 - share
     for i in range(speeding.size):
@@ -122,7 +125,10 @@ def _own_forces(
     transfer: float,
     speeding: FloatArray,
 ) -> None:
-    """Write the forces of both axles' own springs to `sharp`, minus the front one to `load`."""
+    """Write the forces of both axles' own springs, and minus the front axle's force to `load`.
+
+    The forces are in `precompensated` until the loads are precompensated.
+    """
     on = shared_load(crossing.lead, theta, crossing.total_mass_kg, gap)
     own = own_springs(crossing.lead, gap)
     at_1 = own.lever_1_m / crossing.lead.readings_apart_m
@@ -140,7 +146,12 @@ def _own_forces(
         work.corrected[2, 1],
         work.corrected[3, 1],
     )
-    of_lead, first, second, left = work.load[2], work.sharp[0], work.sharp[1], work.body[1]
+    of_lead, first, second, unexplained = (
+        work.load[2],
+        work.precompensated[0],
+        work.precompensated[1],
+        work.body[1],
+    )
     k_1, k_2, c_1, c_2 = theta[K_S1], theta[K_S1 + 1], theta[C_S1], theta[C_S1 + 1]
     for i in range(speeding.size):
         first[i] = k_1 * (z_3[i] - z_1[i] - at_1 * (z_2[i] - z_1[i]))
@@ -155,7 +166,7 @@ def _own_forces(
         moment = on.lever_m * bogie - own.lever_1_m * first[i] - own.lever_2_m * second[i]
         first[i] += own.weight_1 * moment
         second[i] += own.weight_2 * moment
-        left[i] = moment * hard
+        unexplained[i] = moment * hard
         of_lead[i] = first[i] + second[i] - whole_1 * a_1[i] - whole_2 * a_2[i]
 
 

@@ -51,7 +51,7 @@ class Placement(NamedTuple):
     shift_m: float
     bridge: FloatArray
     """Changes (b,) of the bridge's coordinates."""
-    places: NDArray[np.int64]
+    indices: NDArray[np.int64]
     """Indices in y of the bridge's parameters."""
 
 
@@ -75,25 +75,25 @@ def others_effects(
 def _local_fit(problem: PosteriorProblem, y: FloatArray, strategy: SearchStrategy) -> LocalFit:
     """Return the fit of the bridge alone at an offset, all else to first order about y (f,)."""
     where = layout(problem)
-    places = where.bridge
+    indices = where.bridge
     free = np.eye(y.size)
-    held = np.union1d(places, resting_mode_indices(problem, strategy))
+    held = np.union1d(indices, resting_mode_indices(problem, strategy))
     others = others_effects(problem, y, held, _WALK_TEMPERATURE)
 
     def fit_at(shift: float, start: FloatArray) -> tuple[Placement, int]:
         moved = y.copy()
         moved[where.trajectory] += shift
-        rows = tempered_residuals(problem, moved, free[:, places], _WALK_TEMPERATURE)
+        rows = tempered_residuals(problem, moved, free[:, indices], _WALK_TEMPERATURE)
 
         def projected(v: FloatArray) -> FloatArray:
             values = rows(v)
             return np.asarray(values - (values @ others) @ others.T)
 
-        lower = lower_bounds(problem, moved, free[:, places], is_free=True)
+        lower = lower_bounds(problem, moved, free[:, indices], is_free=True)
         found = minimise(
-            projected, start, _WALK_STEPS, _WALK_MIN_IMPROVEMENT, lower, is_followed=True
+            projected, start, _WALK_STEPS, _WALK_MIN_IMPROVEMENT, lower, updates_jacobian=True
         )
-        place = Placement(found.state.objective, shift, found.state.y, places)
+        place = Placement(found.state.objective, shift, found.state.y, indices)
         return place, evaluations_of(found)
 
     return fit_at
@@ -179,5 +179,5 @@ def shifted_to(problem: PosteriorProblem, y: FloatArray, place: Placement) -> Fl
     """Return y (f,) with the bridge at a candidate's offset."""
     moved = y.copy()
     moved[layout(problem).trajectory] += place.shift_m
-    moved[place.places] += place.bridge
+    moved[place.indices] += place.bridge
     return moved

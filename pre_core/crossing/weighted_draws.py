@@ -34,13 +34,13 @@ class WeightedDraws(NamedTuple):
     """Points y (k, f) and their smoothed weights."""
 
     y: FloatArray
-    worth: importance.SmoothedWeights
+    weights: importance.SmoothedWeights
 
 
 def importance_draws(
     target: LogDensity,
     coordinates: surrogate.SurrogateCoordinates,
-    now: surrogate.Surrogate,
+    first: surrogate.Surrogate,
     start: FloatArray,
     wanted: WantedDraws,
     seed: int,
@@ -51,9 +51,9 @@ def importance_draws(
     After `wanted.patience` batches they also end if `_MAX_BATCHES` would not suffice at the present
     rate.
 
-    Each batch is drawn from a surrogate, `now` at first, that all earlier draws have refined; its
-    chains start about `start` (f,). All draws are weighted as draws of the mixture of the
-    surrogates.
+    Each batch is drawn from a surrogate that all earlier draws have refined, the `first` batch from
+    the given one; its chains start about `start` (f,). All draws are weighted as draws of the
+    mixture of the surrogates.
     """
     centre = surrogate.transform(coordinates, start)
     draws = wanted.number
@@ -61,10 +61,11 @@ def importance_draws(
     used: list[surrogate.Surrogate] = []
     y, x = np.empty((0, centre.size)), np.empty((0, centre.size))
     log_target = np.empty(0)
+    current = first
     while True:
         report("weighting draws of the posterior", 0.5 + 0.02 * len(used))
-        new = surrogate.draw(now, coordinates, centre, count, seed, len(used))
-        used.append(now)
+        new = surrogate.draw(current, coordinates, centre, count, seed, len(used))
+        used.append(current)
         log_posterior = _in_parts(target, new)
         y, x = np.concatenate([y, new]), np.concatenate([x, surrogate.transform(coordinates, new)])
         log_target = np.concatenate(
@@ -72,14 +73,14 @@ def importance_draws(
         )
         log_density = np.stack([surrogate.log_likelihood(one, x) for one in used], axis=1)
         counts = np.full(len(used), count)
-        worth = importance.pareto_smooth(
+        weights = importance.pareto_smooth(
             importance.mixture_log_weights(log_target, log_density, counts)
         )
-        limit = _MAX_BATCHES if _is_on_course(worth, draws, len(used)) else wanted.patience
-        if is_enough(worth, draws) or len(used) >= limit:
-            return WeightedDraws(y, worth)
-        now = surrogate.refine(
-            now, coordinates, x, log_target, count, is_weighted=len(used) > _UNWEIGHTED_BATCHES
+        limit = _MAX_BATCHES if _is_on_course(weights, draws, len(used)) else wanted.patience
+        if is_enough(weights, draws) or len(used) >= limit:
+            return WeightedDraws(y, weights)
+        current = surrogate.refine(
+            current, coordinates, x, log_target, count, is_weighted=len(used) > _UNWEIGHTED_BATCHES
         )
 
 
@@ -96,11 +97,11 @@ def _in_parts(target: LogDensity, y: FloatArray) -> FloatArray:
     return np.where(np.isfinite(found), found, -np.inf)
 
 
-def _is_on_course(worth: importance.SmoothedWeights, draws: int, batches: int) -> bool:
-    """Return whether `_MAX_BATCHES` are worth the requested number at the pace of these batches."""
-    return worth.ess * _MAX_BATCHES >= MIN_EFFECTIVE_SHARE * draws * batches
+def _is_on_course(weights: importance.SmoothedWeights, draws: int, batches: int) -> bool:
+    """Return whether `_MAX_BATCHES` would be effective enough at the rate of these batches."""
+    return weights.ess * _MAX_BATCHES >= MIN_EFFECTIVE_SHARE * draws * batches
 
 
-def is_enough(worth: importance.SmoothedWeights, draws: int) -> bool:
-    """Return whether weighted draws are worth the requested number, with a light tail."""
-    return worth.pareto_k <= _LARGEST_PARETO_K and worth.ess >= MIN_EFFECTIVE_SHARE * draws
+def is_enough(weights: importance.SmoothedWeights, draws: int) -> bool:
+    """Return whether weighted draws have the required effective size and a light tail."""
+    return weights.pareto_k <= _LARGEST_PARETO_K and weights.ess >= MIN_EFFECTIVE_SHARE * draws

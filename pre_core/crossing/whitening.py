@@ -51,20 +51,20 @@ def whitener(
     truck: NoisePath,
     density: FloatArray,
     force: FloatArray,
-    road: Mismatch | None = None,
+    mismatch: Mismatch | None = None,
 ) -> Whitener:
     """Return the factor for `count` filtered residuals; `density` (4,) is one-sided, in m/s²/√Hz.
 
-    `force` (2, shapes) is the suspension noise in N²/Hz (`no_suspension_noise` without any), `road`
-    the mismatch. Raise ValueError where the densities leave some residual without noise, or if the
-    mismatch on the bridge is that of another number of residuals.
+    `force` (2, shapes) is the suspension noise in N²/Hz (`no_suspension_noise` without any).
+    Raise ValueError where the densities leave some residual without noise, or if the mismatch on
+    the bridge is that of another number of residuals.
     """
-    has_pavement = road is not None and road.pavement is not None
-    everywhere = None if has_pavement else road
+    has_pavement = mismatch is not None and mismatch.pavement is not None
+    everywhere = None if has_pavement else mismatch
     spectrum = noise_spectrum(truck, density, force, everywhere, rows.omega) * rows.power
     memory = FORCE_MEMORY_S + truck.lag_s if force.any() else 0.0
-    if road is not None:
-        memory = max(memory, _mismatch.correlation_time_s(road))
+    if mismatch is not None:
+        memory = max(memory, _mismatch.correlation_time_s(mismatch))
     turn = phases(rows, memory)
     covariance = np.real(spectrum @ turn)  # E[e_i(t + lag) e_j(t)]
     lags = covariance.shape[2]
@@ -77,8 +77,8 @@ def whitener(
                 if 0 <= offset <= band:
                     one[i, band - offset] = covariance[i, j, lag]
     differing, weight = np.zeros((0, lags)), np.zeros((0, count))
-    if road is not None and road.pavement is not None:
-        differing, weight = _off_and_on_bridge(road, rows, turn)
+    if mismatch is not None and mismatch.pavement is not None:
+        differing, weight = _off_and_on_bridge(mismatch, rows, turn)
         if weight.shape[1] != count:
             raise ValueError(f"the pavement is that of {weight.shape[1]} residuals, not {count}")
     diagonal = one[:, band].copy()
@@ -93,18 +93,18 @@ def whitener(
 
 
 def _off_and_on_bridge(
-    road: Mismatch, rows: RowFilter, turn: NDArray[np.complex128]
+    mismatch: Mismatch, rows: RowFilter, turn: NDArray[np.complex128]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the autocovariances (2, lags) of the mismatch off and on the bridge, and weights.
 
     The mismatch of a filtered residual is the sum of two independent ones with weights (2, m).
     """
-    if road.pavement is None:
+    if mismatch.pavement is None:
         raise ValueError("the bridge has the road's pavement")
     both = np.stack(
-        [_mismatch.spectrum(one, rows.omega) for one in (road, _mismatch.on_bridge(road))]
+        [_mismatch.spectrum(one, rows.omega) for one in (mismatch, _mismatch.on_bridge(mismatch))]
     )
-    share = road.pavement.share
+    share = mismatch.pavement.share
     covariance = np.ascontiguousarray(((both * rows.omega**4 * rows.power) @ turn).real)
     return covariance, np.sqrt(np.stack([1.0 - share, share]))
 

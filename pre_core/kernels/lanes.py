@@ -66,7 +66,7 @@ def _store_if_possible(dispatcher: Any) -> None:
 
 
 def _warn_without_cache(cause: str) -> None:
-    """Warn that kernels are compiled anew; Python prints one warning for each cause."""
+    """Warn that kernels are compiled again; Python prints one warning for each cause."""
     text = f"compiled kernels are not stored, so a start takes minutes: {cause}"
     warnings.warn(text, RuntimeWarning, stacklevel=1)
 

@@ -78,7 +78,7 @@ class BaselineState(NamedTuple):
     covariance: FloatArray  # (m, size, size)
     log_weight: FloatArray
     """Logarithm (m,) of the posterior weight, normalised."""
-    places: Mapping[str, slice]
+    indices: Mapping[str, slice]
     """Indices of each variable in the state, by name: level, drift, slope, season, change, or the
     name of a shared error."""
     scales: Scales
@@ -117,7 +117,7 @@ def scales_compared() -> Scales:
 def initial_baseline(periods: Sequence[Period], scales: Scales) -> BaselineState:
     """Return the state before the first of some periods, with all variables that they need."""
     n, m = periods[0].observation.value.size, scales.change.size
-    blocks: dict[str, FloatArray] = {"level": LEVEL_SPREAD**2 * np.eye(n), "drift": _alike(n)}
+    blocks: dict[str, FloatArray] = {"level": LEVEL_SPREAD**2 * np.eye(n), "drift": _correlation(n)}
     if any(period.temperature_deg_c is not None for period in periods):
         blocks["slope"] = _of_slope(n)
     if any(period.temperature_deg_c is None for period in periods):
@@ -129,30 +129,30 @@ def initial_baseline(periods: Sequence[Period], scales: Scales) -> BaselineState
     for period in periods:
         for one in period.observation.shared:
             blocks.setdefault(one.name, np.eye(one.loading.shape[1]))
-    places, size = {}, 0
+    indices, size = {}, 0
     for name, block in blocks.items():
-        places[name] = slice(size, size + len(block))
+        indices[name] = slice(size, size + len(block))
         size += len(block)
     covariance = np.zeros((m, size, size))
     for name, block in blocks.items():
         factor = scales.drift**2 if name == "drift" else np.ones(m)
-        covariance[:, places[name], places[name]] = factor[:, None, None] * block
+        covariance[:, indices[name], indices[name]] = factor[:, None, None] * block
     mean = np.zeros((m, size))
     mean[:, :n] = periods[0].observation.value
-    return BaselineState(mean, covariance, scales.log_prior, places, scales, periods[0].time_days)
+    return BaselineState(mean, covariance, scales.log_prior, indices, scales, periods[0].time_days)
 
 
 def predict_state(state: BaselineState, time_days: float) -> tuple[BaselineState, FloatArray]:
     """Return the state at a later time, and the remaining share (m,) of the drift."""
     passed = max(0.0, time_days - state.time_days)
     kept = np.exp(-passed / state.scales.correlation_days)
-    at = state.places["drift"]
+    at = state.indices["drift"]
     mean, covariance = state.mean.copy(), state.covariance.copy()
     mean[:, at] *= kept[:, None]
     covariance[:, at, :] *= kept[:, None, None]
     covariance[:, :, at] *= kept[:, None, None]
-    anew = state.scales.drift**2 * (1.0 - kept**2)
-    covariance[:, at, at] += anew[:, None, None] * _alike(at.stop - at.start)
+    added = state.scales.drift**2 * (1.0 - kept**2)
+    covariance[:, at, at] += added[:, None, None] * _correlation(at.stop - at.start)
     return state._replace(mean=mean, covariance=covariance, time_days=time_days), kept
 
 
@@ -161,7 +161,7 @@ def filter_step(state: BaselineState, period: Period) -> Innovation:
     across, noise = _rows(state, period)
     n = len(across)
     cross_covariance = state.covariance @ across.T
-    own = state.scales.change[:, None, None] ** 2 * _alike(n)
+    own = state.scales.change[:, None, None] ** 2 * _correlation(n)
     covariance = across @ cross_covariance + noise + own
     value = period.observation.value - state.mean @ across.T
     return Innovation(value, covariance, across, cross_covariance)
@@ -212,18 +212,18 @@ def standardised(state: BaselineState, innovation: Innovation) -> FloatArray:
 def with_change(state: BaselineState, spread: float) -> BaselineState:
     """Return the state with a change of ln EI from now on, of prior standard deviation `spread`."""
     m, size = state.mean.shape
-    n = state.places["level"].stop
+    n = state.indices["level"].stop
     covariance = np.zeros((m, size + n, size + n))
     covariance[:, :size, :size] = state.covariance
     covariance[:, size:, size:] = spread**2 * np.eye(n)
     mean = np.concatenate([state.mean, np.zeros((m, n))], axis=1)
-    places = {**state.places, _CHANGE: slice(size, size + n)}
-    return state._replace(mean=mean, covariance=covariance, places=places)
+    indices = {**state.indices, _CHANGE: slice(size, size + n)}
+    return state._replace(mean=mean, covariance=covariance, indices=indices)
 
 
 def change_of(state: BaselineState) -> tuple[FloatArray, FloatArray]:
     """Return mean (n,) and covariance (n, n) of the change that `with_change` has added."""
-    at = state.places[_CHANGE]
+    at = state.indices[_CHANGE]
     weight = np.exp(state.log_weight)
     means = state.mean[:, at]
     mean = weight @ means
@@ -233,14 +233,14 @@ def change_of(state: BaselineState) -> tuple[FloatArray, FloatArray]:
 
 def adopt_change(state: BaselineState) -> BaselineState:
     """Return the state with level + change as the level, and without the change."""
-    at = state.places[_CHANGE]
+    at = state.indices[_CHANGE]
     n = at.stop - at.start
     move = np.eye(state.mean.shape[1])
     move[:n, at] = np.eye(n)
     kept = np.delete(move, np.arange(at.start, at.stop), axis=0)
-    places = {name: where for name, where in state.places.items() if name != _CHANGE}
+    indices = {name: where for name, where in state.indices.items() if name != _CHANGE}
     covariance = kept @ state.covariance @ kept.T
-    return state._replace(mean=state.mean @ kept.T, covariance=covariance, places=places)
+    return state._replace(mean=state.mean @ kept.T, covariance=covariance, indices=indices)
 
 
 _CHANGE = "change"
@@ -290,20 +290,20 @@ def _rows(state: BaselineState, period: Period) -> tuple[FloatArray, FloatArray]
     across = np.zeros((n, state.mean.shape[1]))
     noise = of.own
     for name in ("level", "drift", _CHANGE):
-        if name in state.places:
-            across[:, state.places[name]] = np.eye(n)
+        if name in state.indices:
+            across[:, state.indices[name]] = np.eye(n)
     if period.temperature_deg_c is not None:
         warmer = period.temperature_deg_c - REFERENCE_DEG_C
-        across[:, state.places["slope"]] = warmer * np.eye(n)
+        across[:, state.indices["slope"]] = warmer * np.eye(n)
     else:
         phase = 2.0 * np.pi * period.time_days / DAYS_PER_YEAR
-        at = state.places["season"].start
+        at = state.indices["season"].start
         across[:, at : at + n] = np.cos(phase) * np.eye(n)
         across[:, at + n : at + 2 * n] = np.sin(phase) * np.eye(n)
         across[:, at + 2 * n : at + 2 * n + 3] = np.cos(2.0 * phase), np.sin(2.0 * phase), 1.0
         noise = noise + (SLOPE_SPREAD * WEATHER_K) ** 2
     for name, loading in of.shared:
-        across[:, state.places[name]] = loading
+        across[:, state.indices[name]] = loading
     return across, noise
 
 
@@ -311,7 +311,7 @@ def _of_slope(n: int) -> FloatArray:
     return SLOPE_SPREAD**2 + SLOPE_SPREAD_OWN**2 * np.eye(n)
 
 
-def _alike(n: int) -> FloatArray:
+def _correlation(n: int) -> FloatArray:
     """Return the matrix C."""
     return (1.0 - COMMON_CHANGE) * np.eye(n) + COMMON_CHANGE
 

@@ -54,7 +54,7 @@ class AlarmRules(NamedTuple):
     false_alarms_per_year: float = 0.01
     """Tolerated false alarms of one bridge, over all its elements and both directions."""
     periods_per_year: float = 52.0
-    learning: int = 8
+    training: int = 8
     """Number of training periods before the first comparison."""
     at_least: float = SMALLEST_CHANGE
     """Smallest change of EI of interest."""
@@ -126,10 +126,10 @@ class PeriodDifference(NamedTuple):
     high: FloatArray
 
 
-def judged_periods(periods: Sequence[Period], learning: int) -> NDArray[np.bool_]:
+def judged_periods(periods: Sequence[Period], training: int) -> NDArray[np.bool_]:
     """Return flags (periods,) of the periods that can be compared with earlier ones.
 
-    These are periods of known temperature after the first `learning` such periods, and any period
+    These are periods of known temperature after the first `training` such periods, and any period
     a year after the first one, when the season is known without a thermometer.
     """
     out = np.zeros(len(periods), dtype=bool)
@@ -137,7 +137,7 @@ def judged_periods(periods: Sequence[Period], learning: int) -> NDArray[np.bool_
     for number, period in enumerate(periods):
         is_year = period.time_days - periods[0].time_days >= SEASON_DAYS
         has_temperature = period.temperature_deg_c is not None
-        out[number] = number >= learning and (is_year or (has_temperature and warm >= learning))
+        out[number] = number >= training and (is_year or (has_temperature and warm >= training))
         warm += has_temperature
     return out
 
@@ -152,7 +152,7 @@ def detect_change(
     """
     count = len(periods)
     n = periods[0].observation.value.size if count else 0
-    is_judged = judged_periods(periods, rules.learning)
+    is_judged = judged_periods(periods, rules.training)
     rows, statistic = np.full((count, n), np.nan), np.zeros(count)
     threshold = _in_deviations(rules.threshold)
     if not is_judged.any():
@@ -172,7 +172,7 @@ def detect_change(
             innovation = filter_step(state, period)
             rows[number] = standardised(state, innovation)
             inflation = max(1.0, (np.abs(rows[number]).max() / MAX_STANDARDISED) ** 2)
-            drift = state.places["drift"]
+            drift = state.indices["drift"]
             if is_judged[number]:
                 state, gain = _update_unless_outlier(state, innovation, inflation)
                 chart = update_chart(chart, number, kept, drift, gain, innovation, inflation)
@@ -247,7 +247,7 @@ def compare_periods(first: Period, last: Period) -> PeriodDifference:
     plain = [period._replace(temperature_deg_c=0.0) for period in (first, last)]
     motionless = Scales(np.zeros(1), np.zeros(1), np.ones(1), np.zeros(1))
     state = initial_baseline(plain, motionless)
-    at = state.places["slope"]
+    at = state.indices["slope"]
     state.covariance[:, at, at] = 0.0
     state = _since(state, plain[:1], changes=False)
     mean, covariance = change_of(_since(state, plain[1:]))

@@ -63,7 +63,7 @@ class ChartVerdict(NamedTuple):
 def empty_chart(state: BaselineState) -> Chart:
     """Return a chart without periods."""
     m, size = state.mean.shape
-    n = state.places["level"].stop
+    n = state.indices["level"].stop
     return Chart((), np.zeros((m, size, 0, n)), np.zeros((m, 0, n, n)), np.zeros((m, 0, n)))
 
 
@@ -151,7 +151,7 @@ def _is_kept(begin: int, lag: int) -> bool:
 
 def log_ratio(chart: Chart, state: BaselineState, number: int) -> tuple[float, FloatArray]:
     """Return ln R after a period, and ln L (c, n), minus infinity where it is too early."""
-    n = state.places["level"].stop
+    n = state.indices["level"].stop
     if not chart.begins:
         return -np.inf, np.zeros((0, n))
     of_it = np.diagonal(chart.information, axis1=2, axis2=3)

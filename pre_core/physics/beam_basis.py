@@ -38,7 +38,7 @@ from pre_core.physics.bridge import (
     unit_stiffness_matrices,
 )
 
-RIGID_M_PER_N = 2e-12
+LEAST_COMPLIANCE_M_PER_N = 2e-12
 """Compliance added to every bearing, 0.2 µm under an axle of 10 t: without any compliance the
 spring would be infinitely stiff."""
 
@@ -147,7 +147,7 @@ def first_frequencies_hz(basis: BeamBasis, theta: FloatArray) -> FloatArray:
 
 def stiffness_factors(theta: FloatArray, count: int) -> FloatArray:
     """Return the factors (…, count) of the matrices `BeamBasis.stiffness` for theta (…, p)."""
-    vertical = 1.0 / (theta[..., F : F + 2] + RIGID_M_PER_N)
+    vertical = 1.0 / (theta[..., F : F + 2] + LEAST_COMPLIANCE_M_PER_N)
     factors = [theta[..., EI_1:], theta[..., K_ROT : K_ROT + 2], vertical]
     return np.concatenate(factors, axis=-1)[..., :count]
 
@@ -160,7 +160,7 @@ def stiffness_factor(theta: FloatArray, i: int) -> float:
         return theta[EI_1 + i]
     if spring < 2:
         return theta[K_ROT + spring]
-    return 1.0 / (theta[F + spring - 2] + RIGID_M_PER_N)
+    return 1.0 / (theta[F + spring - 2] + LEAST_COMPLIANCE_M_PER_N)
 
 
 @inner

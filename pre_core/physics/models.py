@@ -31,7 +31,7 @@ def from_models(car: HalfCar, beam: Beam) -> FloatArray:
         raise ValueError("the unknown rhoA is one number: the beam must be of one mass per length")
     of = {TRUCK: car, BRIDGE: beam}
     rows = table(beam.flexural_rigidity_nm2.size)
-    return np.array([np.ravel(getattr(of[row.part], row.key, 0.0))[row.which] for row in rows])
+    return np.array([np.ravel(getattr(of[row.part], row.key, 0.0))[row.pair_index] for row in rows])
 
 
 def beam_from(

@@ -192,9 +192,9 @@ def random_surface(
     return Surface(start_m, spacing_m, count, n_x, n_y, amplitude)
 
 
-def axle_profile(surface: Surface, axle: Footprint, beside_m: float = 0.0) -> Profile:
-    """Return the profile of an axle of a truck that drives `beside_m` to the left of y = 0."""
-    moved = axle._replace(offset_m=axle.offset_m + beside_m)
+def axle_profile(surface: Surface, axle: Footprint, lateral_m: float = 0.0) -> Profile:
+    """Return the profile of an axle of a truck that drives `lateral_m` to the left of y = 0."""
+    moved = axle._replace(offset_m=axle.offset_m + lateral_m)
     across = response(moved, np.zeros(1), surface.n_y)
     wave = np.sinc(axle.length_m * surface.n_x) * (surface.amplitude @ across)
     x = surface.start_m + surface.spacing_m * np.arange(surface.samples, dtype=np.float64)

@@ -17,19 +17,19 @@ class LatentCoordinates(NamedTuple):
     return.
     """
 
-    places: NDArray[np.int64]
+    indices: NDArray[np.int64]
     """Indices (p,) of the values that must not be negative; each depends on those before it."""
     log_odds: FloatArray
     """Logarithm (p,) of the probability of zero relative to the density per unit at zero."""
     scale: FloatArray
     """Standard deviations (p,) of v below zero, where its density is half-normal: about those of
     the positive values, so that moves of one length explore both sides."""
-    follow: FloatArray  # (b, p) derivatives of all values with respect to those of `places`
+    follow: FloatArray  # (b, p) derivatives of all values with respect to those of `indices`
 
     def values(self, v: FloatArray) -> FloatArray:
         """Return the values (k, b) of coordinates v (k, b)."""
         y = v.copy()
-        for number, place in enumerate(self.places):
+        for number, place in enumerate(self.indices):
             y[:, place] = _not_negative(y[:, place], self.log_odds[number])
             y += np.outer(y[:, place], self.follow[:, number])
         return y
@@ -37,7 +37,7 @@ class LatentCoordinates(NamedTuple):
     def log_share(self, v: FloatArray) -> FloatArray:
         """Return the log (k,) of the density of v (k, b) over that of its values."""
         y, share = v.copy(), np.zeros(v.shape[0])
-        for number, place in enumerate(self.places):
+        for number, place in enumerate(self.indices):
             odds, scale = self.log_odds[number], self.scale[number]
             relative = y[:, place] / scale
             if np.isfinite(odds):
@@ -51,19 +51,19 @@ class LatentCoordinates(NamedTuple):
 
     def unexplained(self, values: FloatArray) -> FloatArray:
         """Return the changes (b, n) of v for changes (b, n) of values that stay positive."""
-        return np.asarray(values - self.follow @ values[self.places])
+        return np.asarray(values - self.follow @ values[self.indices])
 
 
 def latent_coordinates(
-    places: NDArray[np.int64], log_odds: FloatArray, mean: FloatArray, covariance: FloatArray
+    indices: NDArray[np.int64], log_odds: FloatArray, mean: FloatArray, covariance: FloatArray
 ) -> LatentCoordinates:
     """Return coordinates for values with about this mean (b,) and covariance (b, b).
 
-    Values at the indices `places` (p,) must not be negative; `log_odds` (b,) as in
+    Values at the indices `indices` (p,) must not be negative; `log_odds` (b,) as in
     `LatentCoordinates`: minus infinity where a value is never zero, infinity where it always is.
     """
-    spread = np.sqrt(np.diag(covariance)[places])
-    order = places[np.argsort(mean[places] / spread, kind="stable")]
+    spread = np.sqrt(np.diag(covariance)[indices])
+    order = indices[np.argsort(mean[indices] / spread, kind="stable")]
     follow = np.zeros((mean.size, order.size))
     left = covariance.copy()
     for number, place in enumerate(order):

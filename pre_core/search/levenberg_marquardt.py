@@ -62,7 +62,7 @@ class LMState(NamedTuple):
     damping: float
     differences: DifferenceScheme
     is_fresh: bool = True
-    """Whether the Jacobian was computed at `y` and not updated from elsewhere (`_follow`)."""
+    """Whether the Jacobian was computed at `y` and not updated from elsewhere (`_broyden_step`)."""
 
 
 class LMInfo(NamedTuple):
@@ -163,7 +163,7 @@ def descend(rows: Rows, state: LMState, lower: FloatArray | None = None) -> tupl
     )
 
 
-def _follow(rows: Rows, state: LMState, lower: FloatArray | None) -> tuple[LMState, LMInfo]:
+def _broyden_step(rows: Rows, state: LMState, lower: FloatArray | None) -> tuple[LMState, LMInfo]:
     """Take a step as `descend` does, updating the Jacobian as long as steps succeed.
 
     Broyden's update (Dennis and Schnabel, section 8.1) is the nearest Jacobian that explains the
@@ -261,29 +261,33 @@ def minimise(
     rows: Rows,
     start: FloatArray,
     steps: int,
-    enough: float,
+    min_improvement: float,
     lower: FloatArray | None = None,
     *,
-    is_followed: bool = False,
+    updates_jacobian: bool = False,
     misfit: float = np.inf,
 ) -> SearchResult[LMState, LMInfo]:
-    """Return the minimum near `start` (f,), reached when a step improves by less than `enough`.
+    """Return the minimum near `start` (f,), after at most `steps` steps.
 
-    At most `steps` steps are taken. Where the mean square of the residuals exceeds `misfit`, an
-    improvement by less than a thousandth of the objective also ends the search: its exact minimum
-    is not needed. Where no step helps, forward differences have reached their rounding, which
-    counts as a minimum. With `is_followed` the Jacobian is computed at the start, and then only
-    where updates (`_follow`) fail. A step that improves too little ends the search only with a
-    fresh Jacobian. The Jacobian at the end need not be fresh (`LMState.is_fresh`). No coordinate
-    goes below `lower` (f,).
+    A step that improves by less than `min_improvement` ends the search at a minimum. Where the mean
+    square of the residuals exceeds `misfit`, an improvement by less than a thousandth of the
+    objective also ends the search: its exact minimum is not needed. Where no step helps, forward
+    differences have reached their rounding, which counts as a minimum. With `updates_jacobian` the
+    Jacobian is computed at the start, and then only where updates (`_broyden_step`) fail. A step
+    that improves too little ends the search only with a fresh Jacobian. The Jacobian at the end
+    need not be fresh (`LMState.is_fresh`). No coordinate goes below `lower` (f,).
     """
 
     def step(state: LMState) -> tuple[LMState, LMInfo]:
-        following, info = (_follow if is_followed else descend)(rows, state, lower)
+        following, info = (_broyden_step if updates_jacobian else descend)(rows, state, lower)
         if info.ending is Termination.STUCK:
             return following, info._replace(ending=Termination.CONVERGED)
         is_misfit = following.objective > misfit * state.residual.size
-        least = max(enough, _MISFIT_IMPROVEMENT * state.objective) if is_misfit else enough
+        least = (
+            max(min_improvement, _MISFIT_IMPROVEMENT * state.objective)
+            if is_misfit
+            else min_improvement
+        )
         if info.ending is None and state.objective - following.objective < least:
             if state.is_fresh:
                 return following, info._replace(ending=Termination.CONVERGED)

@@ -52,10 +52,10 @@ def run_search(
     step: Callable[[StateT], tuple[StateT, InfoT]],
     max_steps: int,
     *,
-    at_the_end: Termination = Termination.STEPS_EXHAUSTED,
+    at_limit: Termination = Termination.STEPS_EXHAUSTED,
     progress: Callable[[int, InfoT], None] | None = None,
 ) -> SearchResult[StateT, InfoT]:
-    """Run `step` until the method ends, or end with `at_the_end` after `max_steps` steps."""
+    """Run `step` until the method ends, or end with `at_limit` after `max_steps` steps."""
     state = init()
     infos: list[InfoT] = []
     for count in range(1, max_steps + 1):
@@ -65,4 +65,4 @@ def run_search(
             progress(count, info)
         if info.ending is not None:
             return SearchResult(state, infos, info.ending)
-    return SearchResult(state, infos, at_the_end)
+    return SearchResult(state, infos, at_limit)

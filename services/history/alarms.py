@@ -57,7 +57,7 @@ class AlarmSettings(NamedTuple):
 
     unit: Unit = DEFAULT_UNIT
     false_alarms_per_year: float = DEFAULT_FALSE_ALARMS
-    learning: int = 8
+    training: int = 8
     """Number of training periods."""
     at_least: float = SMALLEST_CHANGE
     """Smallest change of interest, relative to EI."""
@@ -65,7 +65,7 @@ class AlarmSettings(NamedTuple):
     def rules(self) -> AlarmRules:
         """Return these settings for `detect_change`."""
         return AlarmRules(
-            self.false_alarms_per_year, PER_YEAR[self.unit], self.learning, self.at_least
+            self.false_alarms_per_year, PER_YEAR[self.unit], self.training, self.at_least
         )
 
 
@@ -207,7 +207,7 @@ def change_markers(
 ) -> dict[tuple[str, str], list[object]]:
     """Return by realm and bridge the values that change when it has to be checked again."""
     today = [settings.unit, begin_of(now_s, settings.unit)]
-    rules = [settings.false_alarms_per_year, settings.learning, settings.at_least]
+    rules = [settings.false_alarms_per_year, settings.training, settings.at_least]
     bridges = bridges_of(folder).items()
     return {name: [where.stat().st_mtime_ns, *today, *rules] for name, where in bridges}
 
@@ -286,7 +286,7 @@ def _record(
         newest=max((one.entry_s for one in crossings), default=None),
         periods=len(begins),
         judged=0,
-        training=settings.learning,
+        training=settings.training,
         at_least=settings.at_least,
     )
 
@@ -305,7 +305,7 @@ def _judged(
         found = {"judged": len(judged), "judged_from": judged[0], "judged_to": to}
         return record.model_copy(update=found)
     known = sum(period.temperature_deg_c is not None for period in periods)
-    if len(periods) < settings.learning or known == len(periods):
+    if len(periods) < settings.training or known == len(periods):
         return record
     return record.model_copy(update={"year_ends": begins[0] + SEASON_DAYS * DAY_S})
 

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from pre_core import parameters
-from pre_core.crossing import posterior, shaking, slip, speeds
+from pre_core.crossing import common_disturbance, posterior, slip, speeds
 from pre_core.crossing.compliances import MISMATCH_BIAS_SPREAD, mismatch_bias
 from pre_core.crossing.fit import FAR_OFF_CHI2, Optimum, normal_approximation
 from pre_core.crossing.misfit import EXPLAINED_CHI2, fit_off_bridge
@@ -204,7 +204,7 @@ def _fit(data: CrossingData, found: Optimum) -> Fit:
         bool(problem.mismatch.level_m3.any()),
         compared_length_m(problem, y),
         speeds.speed_bias(problem, y),
-        shaking.coherence(problem, y)
+        common_disturbance.coherence(problem, y)
         if has_friction and not posterior.has_tandem(problem)
         else 0.0,
         slip.largest_step(problem, found.state, covariance),

@@ -162,7 +162,7 @@ def _random_walk(
         partial(random_walk.init, problem, settings.particles),
         partial(random_walk.step, problem),
         settings.steps,
-        at_the_end=loop.Termination.STEPS_DONE,
+        at_limit=loop.Termination.STEPS_DONE,
         progress=progress,
     )
     values = state.ratios * nominal[free]

@@ -193,7 +193,7 @@ def absence(bridge: Bridge, row: parameters.ParameterSpec) -> float:
     if not row.may_be_absent:
         return 0.0
     if row.key == "support_rotational_stiffness_nm_per_rad":
-        return {"free": 1.0, "sprung": 0.0}.get(bridge.bearings[row.which], _EVEN)
+        return {"free": 1.0, "sprung": 0.0}.get(bridge.bearings[row.pair_index], _EVEN)
     if row.key == "torsional_flexibility_per_n" and bridge.is_lane_off_axis:
         return 0.0
     return _EVEN

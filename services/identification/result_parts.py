@@ -106,9 +106,9 @@ def nominal_parameters(vehicle: Vehicle, bridge: Bridge) -> Floats:
         of_axles += parameters.SPRINGS
     return np.array(
         [
-            getattr(tandem.axles[row.which], row.key)
+            getattr(tandem.axles[row.pair_index], row.key)
             if tandem is not None and row.key in of_axles
-            else of[row.part].nominal(row.key)[row.which]
+            else of[row.part].nominal(row.key)[row.pair_index]
             for row in parameters.table(bridge.elements)
         ]
     )

@@ -140,10 +140,10 @@ def roads_of_surface(
 
 
 def _profile_under(
-    surface: Surface, axle: Footprint, beside_m: float, pavement: Pavement
+    surface: Surface, axle: Footprint, lateral_m: float, pavement: Pavement
 ) -> Profile:
     """Return the profile of an axle on the surface, stretched laterally."""
     if pavement.anisotropy == 1.0:
-        return axle_profile(surface, axle, beside_m)
+        return axle_profile(surface, axle, lateral_m)
     stretched = on_stretched_surface(axle, pavement.anisotropy)
-    return axle_profile(surface, stretched, beside_m / pavement.anisotropy)
+    return axle_profile(surface, stretched, lateral_m / pavement.anisotropy)

@@ -79,7 +79,7 @@ class WideRun(NamedTuple):
     speed_m_per_s: float
     """Mean speed; it changes as a sine of `change_m_per_s` and `period_s`."""
     forward: bool = True
-    beside_m: float = 0.0
+    lateral_m: float = 0.0
     """Distance of the truck to the left of its lane's middle, seen from start to end."""
     change_m_per_s: float = 0.0
     period_s: float = 10.0
@@ -145,7 +145,7 @@ def drive_case(case: WideCase, number: int) -> WideDrivenRun:
         period_s=how.period_s,
     )
     sign = 1.0 if how.forward else -1.0
-    lane = case.lane_offset_m + how.beside_m
+    lane = case.lane_offset_m + how.lateral_m
     low, high = motion.position_m.min(), motion.position_m.max()
     road = road_under(
         truck,

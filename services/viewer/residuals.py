@@ -139,7 +139,7 @@ def _found(data: CrossingData, result: CrossingResult) -> FittedValues:
 def _by_band(left: FittedResiduals) -> ResidualCells:
     kinds, bands = left.white.shape[1], len(BANDS_HZ) - 1
     mean_square, excess = np.full((kinds, 3, bands), np.nan), np.zeros((kinds, 3, bands))
-    found = quality.residual_bins(left.white, left.stretch, left.step_s, np.array(BANDS_HZ))
+    found = quality.residual_bins(left.white, left.segment, left.step_s, np.array(BANDS_HZ))
     for place, cell in found.items():
         # Of a tandem that shares its load no body equation is a residual.
         if cell.size and left.white[:, place[0]].any():

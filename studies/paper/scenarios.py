@@ -103,7 +103,7 @@ def run_scenario(
         lambda: first,
         partial(random_walk.step, walk),
         asked.steps,
-        at_the_end=loop.Termination.STEPS_DONE,
+        at_limit=loop.Termination.STEPS_DONE,
         progress=lambda count, info: advance("random walk", 1),
     )
     walked = time.perf_counter()

@@ -329,7 +329,7 @@ def more_axles(number: int) -> WideCase:
         int(rng.integers(1 << 31)),
         kind == "same",
         with_errors(sensors, rng),
-        (WideRun(8.0 + 6.0 * number / 15.0, beside_m=WANDER_M * float(rng.standard_normal())),),
+        (WideRun(8.0 + 6.0 * number / 15.0, lateral_m=WANDER_M * float(rng.standard_normal())),),
         {
             "vehicle": vehicle,
             "bridge": declared_bridge(deck, rigidity, rng),

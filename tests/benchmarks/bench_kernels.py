@@ -69,7 +69,7 @@ def test_paper_search(benchmark: BenchmarkFixture) -> None:
             partial(random_walk.init, walk),
             partial(random_walk.step, walk),
             random_walk.STEPS,
-            at_the_end=loop.Termination.STEPS_DONE,
+            at_limit=loop.Termination.STEPS_DONE,
         )
         return state
 

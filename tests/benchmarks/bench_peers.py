@@ -183,7 +183,7 @@ def test_random_walk(benchmark: BenchmarkFixture, scenario: int) -> None:
             partial(random_walk.init, walk),
             partial(random_walk.step, walk),
             random_walk.STEPS,
-            at_the_end=loop.Termination.STEPS_DONE,
+            at_limit=loop.Termination.STEPS_DONE,
         )
         best = state.ratios[np.argmin(state.objective)]
         return {

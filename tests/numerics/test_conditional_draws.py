@@ -45,7 +45,7 @@ class Moments(NamedTuple):
 
 
 def moments(drawn: WeightedDraws) -> Moments:
-    weight = drawn.worth.weight
+    weight = drawn.weights.weight
     mean = weight @ drawn.y
     return Moments(mean, np.sqrt(weight @ (drawn.y - mean) ** 2))
 
@@ -55,8 +55,8 @@ def test_both_ways_draw_the_same_posterior(found: Optimum, inflation: float) -> 
     """They share the residuals, and neither the density of the draws nor its coordinates."""
     all_at_once = sampling.surrogate_draws(found, DRAWS, 2, inflation, silent)
     some = conditional_draws(found, DRAWS, 2, inflation, silent)
-    assert is_enough(all_at_once.worth, DRAWS)
-    assert is_enough(some.weighted.worth, DRAWS)
+    assert is_enough(all_at_once.weights, DRAWS)
+    assert is_enough(some.weighted.weights, DRAWS)
     expected, seen = moments(all_at_once), moments(some.weighted)
     where = posterior.layout(found.problem)
     normal = np.setdiff1d(np.arange(where.size), where.half_normal)

@@ -51,7 +51,7 @@ def better(truth: Optimum) -> Better:
 
 def test_coordinates_are_undone(truth: Optimum) -> None:
     at = _coordinates(truth.problem)
-    y = np.append(truth.state.y[at.places], 0.3)
+    y = np.append(truth.state.y[at.indices], 0.3)
     y[at.restraints], y[at.compliant] = (0.4, 2.0), (0.0, 1.5)
     np.testing.assert_allclose(at.to_y(at.from_y(y)), y, rtol=1e-12)
     assert at.elements.size == 5
@@ -78,9 +78,9 @@ def test_low_frequencies_first_reach_a_bridge_that_all_at_once_miss(truth: Optim
     far = at_nominal_bridge(truth)
     at = _coordinates(far.problem)
     fit = _ContinuedFit(far.problem, far.state.y, STRATEGY, at)
-    best, _ = fit.run(np.append(truth.state.y[at.places], 0.0), ())
-    start = np.zeros(at.places.size + 1)
-    start[np.flatnonzero(np.flatnonzero(far.problem.priors.estimated)[at.places] == RHO_A)] = 2.0
+    best, _ = fit.run(np.append(truth.state.y[at.indices], 0.0), ())
+    start = np.zeros(at.indices.size + 1)
+    start[np.flatnonzero(np.flatnonzero(far.problem.priors.estimated)[at.indices] == RHO_A)] = 2.0
     (at_once, _), (by_stages, _) = fit.run(start, ()), fit.run(start, _STAGES_HZ)
     assert at_once > best + 10.0
     assert by_stages < best + 1.0

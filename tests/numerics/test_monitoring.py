@@ -276,7 +276,7 @@ def test_ratios_are_those_of_a_filter_that_knows_of_the_change() -> None:
     periods = series(rng, weeks=30, loss=0.1, at=20)
     state = initial_baseline(periods, scales_compared())
     chart, states = empty_chart(state), []
-    drift = state.places["drift"]
+    drift = state.indices["drift"]
     for number, period in enumerate(periods):
         states.append(state)
         state, kept = predict_state(state, period.time_days)
@@ -291,7 +291,7 @@ def test_ratios_are_those_of_a_filter_that_knows_of_the_change() -> None:
             continue
         for element in (0, 2):
             stepped = with_change(states[since], STEP_SPREAD)
-            place = stepped.places["change"]
+            place = stepped.indices["change"]
             others = [place.start + n for n in range(N) if n != element]
             stepped.covariance[:, others] = 0.0
             stepped.covariance[:, :, others] = 0.0

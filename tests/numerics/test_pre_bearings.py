@@ -20,7 +20,12 @@ from pre_core.kernels.lanes import LANES
 from pre_core.paper import experiment
 from pre_core.parameters import C_U1, F
 from pre_core.physics import modal_response
-from pre_core.physics.beam_basis import RIGID_M_PER_N, ModalFilters, beam_basis, change_basis
+from pre_core.physics.beam_basis import (
+    LEAST_COMPLIANCE_M_PER_N,
+    ModalFilters,
+    beam_basis,
+    change_basis,
+)
 from pre_core.physics.bridge import Beam, interpolation_matrix, modes, refine
 from pre_core.physics.models import beam_from, from_models
 from pre_core.physics.vehicle import body_masses_kg, total_mass_kg
@@ -301,7 +306,7 @@ def test_modes_of_beams_on_springs(
         np.concatenate(beam_from(theta, LENGTHS, interior)[:3]), np.concatenate(beam[:3])
     )
     ours = filters(theta, LENGTHS, interior)
-    total = (compliance[0] + RIGID_M_PER_N, compliance[1] + RIGID_M_PER_N)
+    total = (compliance[0] + LEAST_COMPLIANCE_M_PER_N, compliance[1] + LEAST_COMPLIANCE_M_PER_N)
     fine = refine(beam._replace(support_compliance_m_per_n=total), 2)
     exact = modes(fine)
     order = np.argsort(ours.modes[:, 0])[:10]

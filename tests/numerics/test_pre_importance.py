@@ -124,8 +124,10 @@ def test_weights_of_a_mixture_know_its_shares() -> None:
     shares = counts / counts.sum() / spreads
     expected = log_target - np.log(np.exp(normal) @ shares)
     assert np.ptp(found - expected) < 0.1
-    worth = importance.pareto_smooth(found)
-    assert float(worth.weight @ x**2) == pytest.approx(1.0, abs=DEVIATIONS * np.sqrt(2 / worth.ess))
+    weights = importance.pareto_smooth(found)
+    assert float(weights.weight @ x**2) == pytest.approx(
+        1.0, abs=DEVIATIONS * np.sqrt(2 / weights.ess)
+    )
     alone = importance.pareto_smooth(found[:3000])  # with the narrow one alone
     assert abs(float(alone.weight @ x[:3000] ** 2) - 1.0) > 0.1
 
@@ -162,14 +164,14 @@ def test_how_likely_a_coordinate_is_nothing() -> None:
     of = coordinates(3, half_normal=np.array([0, 1]), log_odds=np.array([*np.log(odds), -np.inf]))
     poor = of_normal(centre + 0.06, 1.3 * matrix)
     y = surrogate.draw(poor, of, centre, COUNT, 11, 0)
-    worth = importance.pareto_smooth(
+    weights = importance.pareto_smooth(
         gaussian(centre, matrix)(y) - surrogate.log_likelihood(poor, y)
     )
-    assert worth.pareto_k < 0.5
+    assert weights.pareto_k < 0.5
     for which, expected in shares_of_parts(centre, matrix, odds).items():
         there = np.all((y[:, :2] == 0.0) == np.array(which), axis=1)
-        error = np.sqrt(expected * (1.0 - expected) / worth.ess)
-        share = float(worth.weight @ there)
+        error = np.sqrt(expected * (1.0 - expected) / weights.ess)
+        share = float(weights.weight @ there)
         assert abs(share - expected) < DEVIATIONS * error, (which, expected)
         assert abs(share - 1.5 * expected) > DEVIATIONS * error  # it would be noticed
 
@@ -184,14 +186,14 @@ def test_a_surrogate_is_refined_by_weighted_draws() -> None:
     poor = of_normal(moved, matrix * 1.4)
     y = surrogate.draw(poor, of, centre, COUNT, 5, 0)
     better = surrogate.refine(poor, of, y, target(y), COUNT)
-    worth = []
+    effective = []
     for one in (poor, better):
         y = surrogate.draw(one, of, centre, COUNT, 6, 0)
         assert y[:, 0].min() >= 0.0
         log_weight = target(y) - surrogate.log_likelihood(one, y)
-        worth.append(importance.pareto_smooth(log_weight).ess)
-    assert worth[0] < 0.8 * COUNT
-    assert worth[1] > 0.9 * COUNT
+        effective.append(importance.pareto_smooth(log_weight).ess)
+    assert effective[0] < 0.8 * COUNT
+    assert effective[1] > 0.9 * COUNT
 
 
 def test_weights_make_room_for_a_tail() -> None:
@@ -241,16 +243,16 @@ def test_weighted_draws_of_a_posterior_that_leans() -> None:
     of = coordinates(f, curved=np.array([0]), sigma=np.array([0.5]))
     centre = np.array([0.9, *np.zeros(SPARE)])  # not where it should be
     first = of_normal(centre, np.diag([1.3 * spread**2, *np.ones(SPARE)]))
-    y, worth = weighted_draws.importance_draws(target, of, first, np.zeros(f), WANTED, 1, silent)
-    assert weighted_draws.is_enough(worth, 1200)
+    y, weights = weighted_draws.importance_draws(target, of, first, np.zeros(f), WANTED, 1, silent)
+    assert weighted_draws.is_enough(weights, 1200)
     grid = np.linspace(-8.0, 6.0, 20_001)
     density = np.exp(log_density(grid))
     density /= density.sum()
     for power in (1.0, -1.0):
         expected = float(density @ np.exp(power * grid))
         scatter = np.sqrt(float(density @ np.exp(2.0 * power * grid)) - expected**2)
-        mean = float(worth.weight @ np.exp(power * y[:, 0]))
-        assert abs(mean - expected) < DEVIATIONS * scatter / np.sqrt(worth.ess)
+        mean = float(weights.weight @ np.exp(power * y[:, 0]))
+        assert abs(mean - expected) < DEVIATIONS * scatter / np.sqrt(weights.ess)
 
 
 ACCEPTED = pytest.mark.xfail(
@@ -268,7 +270,7 @@ def test_weighted_draws_give_up_where_tails_are_heavy(degrees: float) -> None:
 
     of, narrow = coordinates(20), of_normal(np.zeros(20), 0.5 * np.eye(20))
     found = weighted_draws.importance_draws(target, of, narrow, np.zeros(20), WANTED, 3, silent)
-    assert not weighted_draws.is_enough(found.worth, 1200)
+    assert not weighted_draws.is_enough(found.weights, 1200)
     assert found.y.shape[0] == 400 * weighted_draws._MAX_BATCHES
 
 

@@ -17,7 +17,12 @@ from pre_core.crossing.residuals import roads_and_deflections
 from pre_core.crossing.rows import row_filter
 from pre_core.paper import experiment
 from pre_core.parameters import ALPHA, BETA, C_U1, EI_1, K_ROT, K_U1, KAPPA, RHO_A, F
-from pre_core.physics.beam_basis import RIGID_M_PER_N, BeamBasis, beam_basis, change_basis
+from pre_core.physics.beam_basis import (
+    LEAST_COMPLIANCE_M_PER_N,
+    BeamBasis,
+    beam_basis,
+    change_basis,
+)
 from pre_core.physics.sensors import resample, white_noise
 from services.simulation.drive import DrivenRoad, paper_site, simulate_drive, truck_of
 from tests.numerics.crossings import (
@@ -203,7 +208,7 @@ def test_coordinates_of_another_bridge_leave_everything_alone(truth: Case) -> No
     n = other.stiffness.shape[0] - 4
 
     def stiffness(basis: BeamBasis, theta: FloatArray) -> FloatArray:
-        vertical = 1.0 / (theta[[F, F + 1]] + RIGID_M_PER_N)
+        vertical = 1.0 / (theta[[F, F + 1]] + LEAST_COMPLIANCE_M_PER_N)
         factors = np.concatenate([theta[EI_1 : EI_1 + n], theta[[START, END]], vertical])
         return np.tensordot(factors, basis.stiffness, axes=1)
 

@@ -43,14 +43,14 @@ def drawn(
 
 
 def moments(weighted: WeightedDraws) -> tuple[FloatArray, FloatArray]:
-    mean = weighted.worth.weight @ weighted.y
-    return mean, np.sqrt(weighted.worth.weight @ (weighted.y - mean) ** 2)
+    mean = weighted.weights.weight @ weighted.y
+    return mean, np.sqrt(weighted.weights.weight @ (weighted.y - mean) ** 2)
 
 
 @pytest.mark.parametrize("inflation", [1.0, 1.5])
 def test_bent_posterior_against_quadrature(inflation: float) -> None:
     weighted = drawn(bent, inflation=inflation)
-    assert is_enough(weighted.worth, 1200)
+    assert is_enough(weighted.weights, 1200)
     u, v = (np.linspace(-5.0, 5.0, n) for n in (801, 2001))
     grid = np.stack([one.ravel() for one in np.meshgrid(u, v)], axis=1)
     squares = np.sum(bent(grid) ** 2, axis=0) + prior_squares(grid)
@@ -75,7 +75,7 @@ def test_value_that_may_be_zero_is_so_by_its_odds() -> None:
     squares = (2.0 * (x - 0.5) + 0.3 * x**3) ** 2 + x**2
     above = np.sum(np.exp(-0.5 * (squares - squares[0]))) * (x[1] - x[0])
     expected = np.exp(odds) / (np.exp(odds) + above)
-    zero = float(weighted.worth.weight @ (weighted.y[:, 0] == 0.0))
+    zero = float(weighted.weights.weight @ (weighted.y[:, 0] == 0.0))
     assert zero == pytest.approx(expected, abs=0.06)
 
 
@@ -86,7 +86,7 @@ def test_draws_return_from_where_a_parabola_is_deeper_than_the_residuals() -> No
         return np.stack([8.0 + 4.0 * np.tanh(y[:, 0]), 3.0 * (y[:, 1] - 0.4)])
 
     weighted = drawn(residuals)
-    assert is_enough(weighted.worth, 1200)
+    assert is_enough(weighted.weights, 1200)
     u = np.linspace(-8.0, 8.0, 4001)
     squares = (8.0 + 4.0 * np.tanh(u)) ** 2 + u**2
     share = np.exp(-0.5 * (squares - squares.min()))
@@ -103,8 +103,8 @@ def test_points_that_are_not_possible_are_never_drawn() -> None:
         return out
 
     weighted = drawn(residuals)
-    assert weighted.worth.weight @ (weighted.y[:, 0] > 1.0) < 1e-12
-    assert is_enough(weighted.worth, 1200)
+    assert weighted.weights.weight @ (weighted.y[:, 0] > 1.0) < 1e-12
+    assert is_enough(weighted.weights, 1200)
 
 
 def test_two_bridges_are_drawn_by_their_masses() -> None:
@@ -123,8 +123,8 @@ def test_two_bridges_are_drawn_by_their_masses() -> None:
     first = rng.standard_normal((COUNT, 2)) * [0.12, 0.3] + [-1.0, 0.0]
     first[COUNT // 2 :, 0] += 2.0
     weighted = residual_draws(density, first, 1200, rng, lambda stage, fraction: None)
-    assert is_enough(weighted.worth, 1200)
-    assert weighted.worth.weight @ (weighted.y[:, 0] > 0.0) == pytest.approx(right, abs=0.05)
+    assert is_enough(weighted.weights, 1200)
+    assert weighted.weights.weight @ (weighted.y[:, 0] > 0.0) == pytest.approx(right, abs=0.05)
 
 
 def test_a_narrow_value_that_is_often_zero() -> None:
@@ -152,6 +152,6 @@ def test_a_narrow_value_that_is_often_zero() -> None:
         first = at + rng.multivariate_normal(np.zeros(d), 1.44 * matrix, COUNT)
         first[:, 0] = np.abs(first[:, 0])
         weighted = residual_draws(of, first, 1200, rng, lambda stage, fraction: None)
-        found.append(float(weighted.worth.weight @ (weighted.y[:, 0] == 0.0)))
+        found.append(float(weighted.weights.weight @ (weighted.y[:, 0] == 0.0)))
     assert 0.3 < expected < 0.95
     assert np.mean(found) == pytest.approx(expected, abs=0.08)

@@ -10,7 +10,7 @@ from pre_core.arrays import FloatArray
 from pre_core.crossing import compliances, posterior
 from pre_core.crossing.expected_squares import expected_squares
 from pre_core.crossing.fit import Optimum
-from pre_core.crossing.nuisances import integrated_residuals, place_of_offset
+from pre_core.crossing.nuisances import index_of_offset, integrated_residuals
 from pre_core.crossing.response_surface import (
     ResponseSurface,
     _fit_parabolas,
@@ -58,7 +58,7 @@ def least_squares(found: Optimum, curved: FloatArray, waves: FloatArray) -> floa
     where = posterior.layout(found.problem)
     places = curved_coordinates(found)
     rows = compliances.without_priors(found.problem, found.state.residual.size, places)
-    place, swing = place_of_offset(found.problem), np.arange(where.swing.start, where.swing.stop)
+    place, swing = index_of_offset(found.problem), np.arange(where.swing.start, where.swing.stop)
     y = found.state.y.copy()
     y[places] = curved[:-1]
     y[where.trajectory] += curved[-1] - y[place]
@@ -85,7 +85,7 @@ def test_the_surface_has_the_least_squares_of_the_residuals() -> None:
     of = surface_posterior(found, 1.0, seed=1)
     weighted = draw_curved(found, of.squares, 1000, 7, 1.0)
     rng = np.random.default_rng(3)
-    drawn = weighted.y[rng.choice(weighted.y.shape[0], DRAWS, p=weighted.worth.weight)]
+    drawn = weighted.y[rng.choice(weighted.y.shape[0], DRAWS, p=weighted.weights.weight)]
     bridges = of.points[rng.choice(of.points.shape[0], 60, replace=False), :-1]
     waves = vibration(found, bridges, of.curved)
     true = np.array([least_squares(found, one, waves) for one in drawn])
@@ -100,8 +100,8 @@ def test_integrated_residuals_have_the_least_squares_of_all_residuals() -> None:
     found = at_its_truth(SINGLE)
     weighted = drawn_by_residuals(found, 300, 7, 1.0, lambda stage, fraction: None).weighted
     rng = np.random.default_rng(3)
-    drawn = weighted.y[rng.choice(weighted.y.shape[0], DRAWS, p=weighted.worth.weight)]
-    others = weighted.y[rng.choice(weighted.y.shape[0], 40, p=weighted.worth.weight)]
+    drawn = weighted.y[rng.choice(weighted.y.shape[0], DRAWS, p=weighted.weights.weight)]
+    others = weighted.y[rng.choice(weighted.y.shape[0], 40, p=weighted.weights.weight)]
     waves = vibration(found, others[:, :-1], curved_coordinates(found))
     true = np.array([least_squares(found, one, waves) for one in drawn])
     residuals = integrated_residuals(nuisances_on(found, others), drawn, has_step=True)

@@ -91,7 +91,7 @@ def noise_free(options: TandemOptions, *, is_one_road: bool) -> Driven:
         one._replace(gain_error=0.0, delay_s=0.0, bias_m_per_s2=0.0, noise_ug_per_rthz=0.0)
         for one in case.sensors
     )
-    run = case.runs[0]._replace(beside_m=0.0, change_m_per_s=0.3, forward=True)
+    run = case.runs[0]._replace(lateral_m=0.0, change_m_per_s=0.3, forward=True)
     case = case._replace(sensors=sensors, runs=(run,), receiver=EXACT, is_one_road=is_one_road)
     return Driven(case, drive_case(case, 0))
 
@@ -445,7 +445,7 @@ def test_power_of_the_front_axle_is_that_of_its_noise_in_the_mismatch() -> None:
     weights = rng.multivariate_normal(np.zeros(len(covariance)), covariance, 400)
     noise = (response.columns[0] @ weights.T)[some]
     nothing = np.zeros((1, 1))
-    seen = [tapered_periodogram(one, nothing[0], nothing).seen for one in noise.T]
+    seen = [tapered_periodogram(one, nothing[0], nothing).observed for one in noise.T]
     expected, by_values = front_axle.front_axle_power(response, some)
     clear = expected > 1e-3 * expected.max()
     assert np.mean(seen, axis=0)[clear] == pytest.approx(expected[clear], rel=0.3)

@@ -62,7 +62,7 @@ def test_an_alarm_is_raised_once_and_stands_over_any_restart(history: Path) -> N
     everything = check(history, AlarmSettings(), AFTER_S, everything=True)
     assert (everything.raised, everything.active) == ((), first.active)
     # Whatever would be found now: it stands until somebody acknowledges it.
-    sleepy = AlarmSettings(learning=500)
+    sleepy = AlarmSettings(training=500)
     assert check(history, sleepy, AFTER_S, everything=True).active == first.active
 
 
@@ -100,7 +100,7 @@ def watch_now(history: Path, bridge: str = "bridge-1", now_s: float = AFTER_S) -
 
 def test_only_a_watch_that_judged_says_that_nothing_has_changed(history: Path) -> None:
     assert watch_now(history).state == "never_checked"
-    check(history, AlarmSettings(learning=40), AFTER_S)
+    check(history, AlarmSettings(training=40), AFTER_S)
     training = watch_now(history)
     assert (training.state, training.found_nothing) == ("training", False)
     assert training.sentence == (

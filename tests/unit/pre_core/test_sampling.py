@@ -19,8 +19,8 @@ DRAWS = PosteriorDraws(np.zeros((10, 4, 2)), 1.004, 1156.0, 1.0, 0, Termination.
 def test_failed_draws_of_alike_tyres_keep_their_diagnostics(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    worth = SmoothedWeights(np.full(200, 1.0 / 200.0), 1.2, 12.0)
-    weighted = WeightedDraws(np.zeros((200, 3)), worth)
+    weights = SmoothedWeights(np.full(200, 1.0 / 200.0), 1.2, 12.0)
+    weighted = WeightedDraws(np.zeros((200, 3)), weights)
     drawn = ResidualDraws(weighted, 407, None)
     monkeypatch.setattr(sampling, "drawn_by_residuals", lambda *given: drawn)
     monkeypatch.setattr(sampling, "_compliance_draws", lambda *given: DRAWS)

@@ -216,8 +216,7 @@ def test_too_few_steps_are_an_ending_of_their_own(method: Method, window: PaperW
     init, step = method.bind(window, 1, 2)
     assert loop.run_search(init, step, 1)[2] is Termination.STEPS_EXHAUSTED
     assert (
-        loop.run_search(init, step, 1, at_the_end=Termination.STEPS_DONE)[2]
-        is Termination.STEPS_DONE
+        loop.run_search(init, step, 1, at_limit=Termination.STEPS_DONE)[2] is Termination.STEPS_DONE
     )
 
 
@@ -376,7 +375,7 @@ def test_slopes_that_are_led_on_end_at_the_same_bottom_for_less(seed: int) -> No
     start = np.where(np.arange(12) < 2, 0.5, 2.0)
     exact = levenberg_marquardt.minimise(rows, start, 100, 1e-9, lower)
     counted, asked = asked, 0
-    found = levenberg_marquardt.minimise(rows, start, 100, 1e-9, lower, is_followed=True)
+    found = levenberg_marquardt.minimise(rows, start, 100, 1e-9, lower, updates_jacobian=True)
     assert found.ending is Termination.CONVERGED
     assert asked == 13 + sum(info.evaluations for info in found.infos)
     assert asked < 0.85 * counted
@@ -386,8 +385,8 @@ def test_slopes_that_are_led_on_end_at_the_same_bottom_for_less(seed: int) -> No
     assert np.all(found.state.y >= lower)
 
 
-@pytest.mark.parametrize("is_followed", [False, True])
-def test_a_point_far_off_is_turned_back_from_without_a_word(is_followed: bool) -> None:
+@pytest.mark.parametrize("updates_jacobian", [False, True])
+def test_a_point_far_off_is_turned_back_from_without_a_word(updates_jacobian: bool) -> None:
     """Rows so large that their squares are infinite; warnings are errors here."""
 
     def rows(y: np.ndarray) -> np.ndarray:
@@ -396,7 +395,9 @@ def test_a_point_far_off_is_turned_back_from_without_a_word(is_followed: bool) -
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         start = np.array([0.69, -0.69])
-        found = levenberg_marquardt.minimise(rows, start, 50, 1e-9, is_followed=is_followed)
+        found = levenberg_marquardt.minimise(
+            rows, start, 50, 1e-9, updates_jacobian=updates_jacobian
+        )
     np.testing.assert_allclose(found.state.y, np.arctanh(0.5), atol=1e-4)
 
 
@@ -448,14 +449,14 @@ def test_a_descent_ends_with_the_first_step_that_gains_too_little() -> None:
     assert gains[-1] < 1.0
 
 
-@pytest.mark.parametrize("is_followed", [False, True])
-def test_a_descent_to_a_misfit_ends_where_a_thousandth_is_gained(is_followed: bool) -> None:
+@pytest.mark.parametrize("updates_jacobian", [False, True])
+def test_a_descent_to_a_misfit_ends_where_a_thousandth_is_gained(updates_jacobian: bool) -> None:
     def rows(y: np.ndarray) -> np.ndarray:
         return np.column_stack([np.sinh(y[:, 0]), np.full(y.shape[0], 100.0)])
 
     def steps(misfit: float) -> int:
         found = levenberg_marquardt.minimise(
-            rows, np.array([3.0]), 200, 1e-9, is_followed=is_followed, misfit=misfit
+            rows, np.array([3.0]), 200, 1e-9, updates_jacobian=updates_jacobian, misfit=misfit
         )
         assert found.ending is Termination.CONVERGED
         return len(found.infos)

@@ -66,7 +66,7 @@ def test_recording_has_road_before_and_behind_the_bridge(driven: WideDrivenRun) 
 @pytest.mark.parametrize("forward", [True, False])
 def test_perfect_receiver_shows_lane_and_chainage(forward: bool) -> None:
     drawn = short(draw_wide(2))
-    run = drawn.runs[0]._replace(forward=forward, beside_m=0.2, change_m_per_s=0.0)
+    run = drawn.runs[0]._replace(forward=forward, lateral_m=0.2, change_m_per_s=0.0)
     case = drawn._replace(runs=(run,))
     found = drive_case(case, 0)
     gnss = found.run.gnss
