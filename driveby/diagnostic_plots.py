@@ -1,4 +1,4 @@
-"""Pictures of one crossing for researchers: residual road, posterior and chains."""
+"""Figures of one crossing for researchers: residual road, posterior and chains."""
 
 from collections.abc import Sequence
 from typing import Final

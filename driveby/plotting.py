@@ -1,4 +1,4 @@
-"""The picture of one crossing or one bridge: flexural rigidity along the span, and the road."""
+"""The figure of one crossing or one bridge: flexural rigidity along the span, and the road."""
 
 import matplotlib
 from matplotlib.figure import Figure

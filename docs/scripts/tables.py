@@ -156,7 +156,7 @@ def _needed(needs: ListedCommand) -> str:
 _FOR = {
     "none": "bus, recordings, CSV import and export, credentials",
     "identify": "computation: identify, simulate, check, plan, fuse, compare",
-    "view": "the Rerun viewer and its files, pictures, reports",
+    "view": "the Rerun viewer and its files, figures, reports",
     "history": "results over years, alarms, catalogues, Parquet; remote folders through fsspec",
     "ros2": "recordings of ROS 2 and the gateway",
     "s3": "addresses such as s3://bucket/fleet, with `history`",

@@ -101,7 +101,7 @@ def identify_command(
 
         with steps_bar(f"drawing into {asked.figures}", console) as drawn:
             written = write_pictures(asked.figures, found, known, drawn, request.fusing.baselines)
-        line = f"{count_of(len(written), 'picture')} in {asked.figures}"
+        line = f"{count_of(len(written), 'figure')} in {asked.figures}"
         console.print(line, soft_wrap=True)
     if asked.draws is not None:
         some = [crossing for crossing in found.crossings if crossing.crossing_id in draws]
@@ -297,14 +297,14 @@ def print_validation(console: "Console", found: Results, site: Site, folder: Pat
 
 
 def _as_state(bridge: Bridge, state: BridgeResult) -> str:
-    """Return the lowest element of a state of one crossing, as reports and pictures show it."""
+    """Return the lowest element of a state of one crossing, as reports and figures show it."""
     nominal = bridge.nominal_flexural_rigidity_nm2
     ratio, low, high, name = min(
         (one.mean / ei, one.q025 / ei, one.q975 / ei, name)
         for (name, one), ei in zip(state.elements.items(), nominal, strict=True)
     )
     return (
-        f"lowest EI/nominal in reports (wider by between-crossing variability): {name} {ratio:.3f} "
+        f"lowest EI/nominal in reports (interval includes between-crossing variability): {name} {ratio:.3f} "
         f"({low:.3f} … {high:.3f})"
     )
 

@@ -29,7 +29,7 @@ _VIEW: Final = ("view",)
 _HISTORY: Final = ("history",)
 COMMANDS: Final[Mapping[str, ListedCommand]] = {
     "survey": ListedCommand(
-        "plan a survey: expected accuracy, detection probability, most useful change",
+        "plan a survey: expected accuracy, detection probability, best improvements",
         _IDENTIFY,
         {"figure": _VIEW},
     ),

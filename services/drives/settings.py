@@ -46,7 +46,7 @@ class ImportOptions:
         group=_TABLES,
     )
     picture: Path | None = output_option(
-        "picture of the first run as interpreted; writes no recording",
+        "figure of the first run as interpreted; writes no recording",
         "OUT.png",
         PNG,
         group=_TABLES,

@@ -51,8 +51,8 @@ class TruckSettings(OnTheBus):
     realm: str = realm_option()
     speed: float = speed_option(
         1.0,
-        other="; if it is not 1, the logger takes the age of the samples for a wrong clock, except "
-        "in realms sim-…",
+        other="; at other values than 1 the logger reports a wrong clock of the truck, except in "
+        "realms sim-…",
     )
     skip_gaps: bool = flag("skip gaps of more than 2 s, as between runs")
     vehicle: str | None = opt(

@@ -1,1 +1,1 @@
-"""Pictures of recordings and results: figures as PNG or SVG, and files for the Rerun viewer."""
+"""Figures of recordings and results as PNG or SVG, and files for the Rerun viewer."""

@@ -220,7 +220,7 @@ def _baseline(site: Path, bridge: str) -> "StoredBaseline | None":
 
 
 def _drawn(options: HistoryOptions, past: "BridgeHistory") -> Iterator[Path]:
-    """Draw the requested pictures."""
+    """Draw the requested figures."""
     if options.figures is not None:
         from services.common.files import make_folder
         from services.viewer.history_figure import history_figure

@@ -85,7 +85,7 @@ def _survey(options: SurveyPlanOptions) -> int:
 
     figure = options.figure
     if figure is not None and figure.suffix not in (".png", ".svg"):
-        raise InputError(f"{figure}: the name of a picture (.png or .svg) is expected")
+        raise InputError(f"{figure}: the name of a figure (.png or .svg) is expected")
     for path in (figure, options.json):
         if path is not None:
             check_writable(path)

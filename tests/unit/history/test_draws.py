@@ -58,7 +58,7 @@ def test_the_draws_are_those_of_the_result_and_of_what_is_printed(
     assert "weight of the truck's body equations: 100 %" in printed
     # The state of the bridge, as the report has it, is not without the variability.
     assert (
-        "\nlowest EI/nominal in reports (wider by between-crossing variability): EI_4 0.4"
+        "\nlowest EI/nominal in reports (interval includes between-crossing variability): EI_4 0.4"
         in printed
     )
     assert "pareto_k" in crossing.diagnostics

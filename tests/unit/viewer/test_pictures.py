@@ -217,7 +217,7 @@ def test_identify_draws_what_it_found(
     recording, folder = project / "tests/data/noise_free.mcap", tmp_path / "pictures"
     options = ("--method", "least-squares", "--figures", str(folder))
     assert cli.main(["identify", str(recording), *options]) == 0
-    assert f"4 pictures in {folder}" in capsys.readouterr().out
+    assert f"4 figures in {folder}" in capsys.readouterr().out
     assert len(list(folder.iterdir())) == 4
     (tmp_path / "file").touch()
     code = cli.main(["identify", str(recording), "--figures", str(tmp_path / "file" / "x")])
