@@ -331,7 +331,7 @@ def _which(row: ParameterSpec) -> str:
     """Return which of a pair of quantities a parameter is; empty if there is one only."""
     if sum(one.key == row.key for one in SCALARS) == 1:
         return ""
-    return f", {(('front', 'rear') if row.part == TRUCK else ('start', 'end'))[row.which]}"
+    return f", {(('front', 'rear') if row.part == TRUCK else ('start', 'end'))[row.pair_index]}"
 
 
 # Reasons

@@ -304,8 +304,8 @@ def _as_state(bridge: Bridge, state: BridgeResult) -> str:
         for (name, one), ei in zip(state.elements.items(), nominal, strict=True)
     )
     return (
-        f"lowest EI/nominal in reports (interval includes between-crossing variability): {name} {ratio:.3f} "
-        f"({low:.3f} … {high:.3f})"
+        "lowest EI/nominal in reports (interval includes between-crossing variability): "
+        f"{name} {ratio:.3f} ({low:.3f} … {high:.3f})"
     )
 
 
