@@ -22,7 +22,7 @@ from pre_core.fusion.mass import mass_sensitivity
 from schemas.fusion import FusionLikelihood
 from schemas.results import CrossingResult, Parameter, ResultHeader, Results, load_results, results
 from services.common.arrays import Floats
-from services.identification.fusing import part_of
+from services.identification.fusing import fusion_input
 from services.identification.observed import observation_of
 from services.identification.usable import Source
 
@@ -105,7 +105,7 @@ def crossing_of(
     """A crossing of a bridge that has a rigidity at that time."""
     of = template.likelihood
     name = f"{truck.name}.{bridge.name}.{entry_s:.3f}"
-    part, priors = part_of(Source(name, truck.name, 1, of))
+    part, priors = fusion_input(Source(name, truck.name, 1, of))
     n, b = priors.elements, len(of.bridge)
     x = np.concatenate([bridge.others, priors.coordinates.location[b - n :] / ei_nm2])
     # The mass scales truck and bridge alike: what is found of the bridge lies aside of what it is.

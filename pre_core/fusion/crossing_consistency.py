@@ -42,9 +42,9 @@ _UNLIKELY = 1e-6
 class ConsistencyResult(NamedTuple):
     """Names of the consistent and of the excluded crossings."""
 
-    agree: tuple[str, ...]
-    left_out: tuple[str, ...]
-    disagree: bool
+    consistent: tuple[str, ...]
+    excluded: tuple[str, ...]
+    is_contradictory: bool
     """Whether the kept crossings contradict each other and are too few to show which is wrong."""
 
 
@@ -60,26 +60,26 @@ def select_consistent(
     if len(names) < _FEWEST:
         return ConsistencyResult(names, (), bool(chances.min() < _SUSPICIOUS / len(names)))
     worst = np.argsort(chances)[: len(names) // _FEWEST]
-    odd = {names[i] for i in worst if chances[i] < _SUSPICIOUS / len(names)}
-    if odd:
+    excluded = {names[i] for i in worst if chances[i] < _SUSPICIOUS / len(names)}
+    if excluded:
         # An outlier must not affect the estimated variability.
-        information = build_joint(parts, priors, consistent=set(names) - odd)
-    back = odd
-    while odd and back:
-        inside = [name for name in names if name not in odd]
+        information = build_joint(parts, priors, consistent=set(names) - excluded)
+    back = excluded
+    while excluded and back:
+        inside = [name for name in names if name not in excluded]
         found = variability_posterior(
             information._replace(crossings=information.select(inside)), priors
         )
         changes = np.column_stack([found.tau, found.rho, found.weight])[found.weight > _UNLIKELY]
         of = zip(
-            sorted(odd),
-            _tail_probabilities(information, priors, sorted(odd), inside, changes),
+            sorted(excluded),
+            _tail_probabilities(information, priors, sorted(excluded), inside, changes),
             strict=True,
         )
         back = {name for name, chance in of if chance >= _INCOMPATIBLE / len(names)}
-        odd = odd - back
-    agree = tuple(name for name in names if name not in odd)
-    return ConsistencyResult(agree, tuple(sorted(odd)), False)
+        excluded = excluded - back
+    consistent = tuple(name for name in names if name not in excluded)
+    return ConsistencyResult(consistent, tuple(sorted(excluded)), False)
 
 
 def _tail_probabilities(

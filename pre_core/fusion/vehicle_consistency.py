@@ -40,7 +40,7 @@ class VehicleConsistency(NamedTuple):
 
     misattributed: tuple[str, ...]
     """Names of misattributed crossings."""
-    disagree: bool
+    is_contradictory: bool
     """Whether others contradict each other, without showing which is wrong."""
 
 

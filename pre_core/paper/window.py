@@ -64,7 +64,7 @@ class PaperWindow(NamedTuple):
     load_transfer_n: FloatArray  # (n,): taken off the front axle's load, put on the rear's
     signals: FloatArray  # (2, 4, n): see iep.py
     stretches: IntArray  # (s, 4): first sample, last + 1, part under front, under rear (-1 none)
-    place: FloatArray  # (2, n): place 0..1 within the part
+    place: FloatArray  # (2, n): local coordinate 0..1 of the part
     first_row: int  # sample of row 0
     front_sample: IntArray  # (m,): first of the four samples at which the front passed the same x
     front_weight: FloatArray  # (m, 4)

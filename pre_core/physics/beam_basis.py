@@ -49,8 +49,8 @@ class BeamBasis(NamedTuple):
     `stiffness` (n + 2 or n + 4, m, m) has dK/ds for the EI of the n elements, then for the two
     rotational springs at the ends, then for the two vertical ones if bearings are compliant. The
     mass matrix of 1 kg/m is the identity. `cubics` (n * parts, 4, m) has the deflection in each
-    part for a unit of each coordinate, as powers of the place 0..1 within the part. `lengths_m` is
-    (n * parts,).
+    part for a unit of each coordinate, as powers of the local coordinate 0..1 of the part.
+    `lengths_m` is (n * parts,).
     """
 
     stiffness: FloatArray

@@ -229,9 +229,9 @@ def strain_energy_shares(beam: Beam) -> FloatArray:
 def locate_element(
     element_lengths_m: FloatArray, x_m: FloatArray
 ) -> tuple[NDArray[np.int64], FloatArray]:
-    """Return the element index (…), from 0, and the place (…) 0..1 within it for chainages (…).
+    """Return the element index (…), from 0, and the local coordinate (…) 0..1 for chainages (…).
 
-    Off the bridge the index is -1 and the place 0.
+    Off the bridge the index is -1 and the coordinate 0.
     """
     edges = np.concatenate([[0.0], np.cumsum(element_lengths_m)])
     element = np.clip(np.searchsorted(edges, x_m, side="right") - 1, 0, element_lengths_m.size - 1)
@@ -258,7 +258,7 @@ def element_cubics(
 ) -> FloatArray:
     """Return the deflection in each element for k nodal vectors (d, k): (n, 4, k).
 
-    These are the factors of the powers 0 to 3 of the place 0..1 within the element.
+    These are the factors of the powers 0 to 3 of the local coordinate 0..1 of the element.
     """
     dofs = element_dofs(element_lengths_m.size, held)
     padded = np.vstack([nodal, np.zeros((1, nodal.shape[1]))])  # row -1: fixed deflections

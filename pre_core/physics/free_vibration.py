@@ -36,7 +36,7 @@ def free_vibration_after(
     state = np.zeros((2, modes.eigenvalues_per_s2.size))
     for e in elements if speed_m_per_s > 0.0 else reversed(elements):
         c = cubics[e]
-        if speed_m_per_s < 0.0:  # place within the element, counted from its far end
+        if speed_m_per_s < 0.0:  # local coordinate, counted from the far end of the element
             c = np.array(
                 [
                     c[0] + c[1] + c[2] + c[3],

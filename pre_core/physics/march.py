@@ -115,7 +115,7 @@ def _strut(
 def _shapes(
     cubics: FloatArray, xi: float, length: float, shape: FloatArray, slope: FloatArray
 ) -> None:
-    """Compute modes and slopes (k,) at the place `xi` of an element with `cubics` (4, k)."""
+    """Compute modes and slopes (k,) at the coordinate `xi` of an element with `cubics` (4, k)."""
     for k in range(shape.size):
         c0, c1, c2, c3 = cubics[0, k], cubics[1, k], cubics[2, k], cubics[3, k]
         shape[k] = ((c3 * xi + c2) * xi + c1) * xi + c0

@@ -35,8 +35,8 @@ MODES = GROUPS * LANES
 class TorsionBasis(NamedTuple):
     """The data that all evaluations of a twisting deck share; empty for one that does not twist.
 
-    `cubics` (parts, 4, modes) has unit sines of the part's span, in powers of the place 0..1 within
-    the part.
+    `cubics` (parts, 4, modes) has unit sines of the part's span, in powers of the local coordinate
+    0..1 of the part.
     """
 
     cubics: FloatArray
@@ -87,9 +87,10 @@ def span_ends_m(part_lengths_m: FloatArray, supports: tuple[int, ...]) -> FloatA
 
 
 def sine_cubics(part_m: FloatArray, span_m: FloatArray, modes: int) -> FloatArray:
-    """Return cubics (4, modes) in the place 0..1 of a part (2,) through a span's (2,) unit sines.
+    """Return cubics (4, modes) of a part (2,) through a span's (2,) unit sines.
 
-    Values and slopes are those of the sines at both ends of the part (Hermite).
+    They are in the local coordinate 0..1 of the part. Values and slopes are those of the sines at
+    both ends of the part (Hermite).
     """
     length = part_m[1] - part_m[0]
     wave = np.arange(1, modes + 1) * np.pi / (span_m[1] - span_m[0])

@@ -41,8 +41,8 @@ from services.identification.bridge_state import (
     FusionSettings,
     RecentCrossings,
     add_crossings,
-    against,
     usable,
+    with_loss_probability,
 )
 from services.identification.methods import window_of
 from services.identification.outputs import FusionTask, IdentificationTask
@@ -113,7 +113,7 @@ def identify_archive(
     counted: dict[tuple[str, str], RecentCrossings] = {}
     with one_blas_thread():
         for crossing, was_there in _identified(job, problems, execution, store):
-            crossing = against(crossing, job.fusing.baselines.get(crossing.bridge))
+            crossing = with_loss_probability(crossing, job.fusing.baselines.get(crossing.bridge))
             verdicts[crossing.verdict] += 1
             there += was_there
             if is_failed(crossing):

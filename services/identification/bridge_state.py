@@ -37,7 +37,7 @@ from services.identification.comparison import (
     weak_before,
 )
 from services.identification.fusing import FusedBridge, fused
-from services.identification.result_parts import element_edges_m, part_of_elements
+from services.identification.result_parts import element_edges_m, element_shares
 from services.identification.usable import LISTED_AT_MOST as LISTED_AT_MOST
 from services.identification.usable import FusableCrossing
 from services.identification.usable import RecentCrossings as RecentCrossings
@@ -72,7 +72,7 @@ _BASELINE_SHARE = 0.9
 """Share of the baseline's EI in `Derived.probability_below_90_percent_of_baseline`."""
 
 
-def against(result: CrossingResult, baseline: BridgeResult | None) -> CrossingResult:
+def with_loss_probability(result: CrossingResult, baseline: BridgeResult | None) -> CrossingResult:
     """Return the result with its probabilities of loss against a stored state of the bridge."""
     if baseline is None or result.derived is None or result.parameters is None:
         return result
@@ -134,7 +134,7 @@ def state_of(
         )
     sources = [one.source for one in wanted if one.source is not None]
     found = fused(sources, report, fusing.threads)
-    left_out |= dict.fromkeys(found.left_out, LeftOutReason.DISAGREES)
+    left_out |= dict.fromkeys(found.excluded, LeftOutReason.DISAGREES)
     left_out |= dict.fromkeys(found.other_model, LeftOutReason.OTHER_MODEL)
     between = _summary(found.between)
     reasons = _reasons(found, between, wanted)
@@ -170,13 +170,13 @@ def _reasons(
     `between` is the variability between crossings; `crossings` are in the order of their entries.
     """
     reasons = []
-    if found.disagree or between.q025 > _LARGEST_BETWEEN:
+    if found.is_contradictory or between.q025 > _LARGEST_BETWEEN:
         reasons.append(BridgeReason.CROSSINGS_DISAGREE)
-    if len(found.left_out) >= _MANY:
+    if len(found.excluded) >= _MANY:
         newest = {one.crossing_id for one in crossings[-_MANY:]}
         reasons.append(
             BridgeReason.NEWEST_DISAGREE
-            if newest <= set(found.left_out)
+            if newest <= set(found.excluded)
             else BridgeReason.MANY_LEFT_OUT
         )
     if any(one.verdict != "good" and one.crossing_id in found.used for one in crossings):
@@ -192,7 +192,7 @@ def _thirds(found: FusedBridge) -> ThirdsState:
     )
 
 
-class States:
+class BridgeStateCache:
     """States of bridges, recomputed only after new crossings: one takes up to a second."""
 
     def __init__(self, fusing: FusionSettings) -> None:
@@ -294,7 +294,7 @@ def _losses(ratio: Floats) -> dict[str, float]:
 
 
 def _level(found: FusedBridge, begin: float, end: float) -> ElementState:
-    share = part_of_elements(found.element_lengths_m, begin, end)
+    share = element_shares(found.element_lengths_m, begin, end)
     return _summary(np.exp(np.log(found.ei_nm2 / found.nominal_nm2) @ share))
 
 

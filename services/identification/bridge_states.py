@@ -13,8 +13,8 @@ from services.identification.bridge_state import (
     FusionSettings,
     RecentCrossings,
     add_crossings,
-    against,
     usable,
+    with_loss_probability,
 )
 from services.identification.known import CrossingRecord
 from services.identification.outputs import FusionTask, IdentificationTask, Output, state_output
@@ -119,7 +119,7 @@ class BridgeStates:
         self, bridge: _OfBridge, found: PendingCrossing, result: CrossingResult
     ) -> Iterator[Output | FusionTask]:
         realm, name = found.task.data.realm, found.task.data.bridge.id
-        result = against(result, self._fusing.baselines.get(name))
+        result = with_loss_probability(result, self._fusing.baselines.get(name))
         if found.task.certificate is not None:
             result = result.model_copy(update={"certificate": found.task.certificate})
         counts = usable(result)

@@ -25,10 +25,10 @@ _BANDS_HZ = np.array([0.0, 6.0, 12.0, 30.0, np.inf])
 """Frequency bands. The motion of bridge, body and wheels is mostly in the first three."""
 _FALSE_ALARM_Z = 4.5
 """Threshold that one of 36 residual bins exceeds by chance in 1e-4 of the crossings."""
-_SLACK = (1.35, 1.35, 1.35, 1.15)
+_TOLERATED_POWER = (1.35, 1.35, 1.35, 1.15)
 """Tolerated noise power of each band, relative to the declared one. The declared density comes from
 a data sheet, which omits the sensor's 1/f noise."""
-_SLACK_WITH_MISMATCH = 1.6
+_TOLERATED_WITH_MISMATCH = 1.6
 """Tolerated power where the axles' profiles differ: three standard deviations of a mismatch level
 estimated from some ten waves."""
 SHORTEST_APPROACH_M = 12.0
@@ -55,7 +55,7 @@ delays are known to 0.5 ms. A plate that bends across its axis resembles a step 
 _LARGEST_SPEED_SCALE_Z = 5.0
 """Largest tolerated difference between the receiver's speeds and the derivative of its positions,
 in standard deviations. Fault-free: at most 2."""
-_RECEIVER_ASIDE_S = 4.0
+_COMPARED_FIXES_S = 4.0
 """Time before and after the bridge over which fixes are compared; the fit uses the same."""
 _SPEED_SCALE_SPREAD = 0.002
 """Standard deviation of the speed scale for a road that is not quite parallel to the bridge's
@@ -64,20 +64,20 @@ _LARGEST_SPEED_BIAS, _LARGEST_SPEED_BIAS_Z = 1.0, 5.0
 """Largest tolerated mean difference between the receiver's speeds and the fit's, in multiples of
 their noise and of the standard error of the mean. Fault-free: at most 0.3 at ten fixes a second;
 speeds 3 % high: 1.3 to 3.7."""
-_COMMON = 0.7
+_LARGEST_COHERENCE = 0.7
 """Largest tolerated coherence between the residuals of the body equations, where they exceed the
 sensors' noise. Dry friction and nonlinear dampers: -0.13 to 0.28; tilted sensors on a truck that
 shakes above 2 Hz: 0.95 to 0.97."""
-_COARSE = 1.4
+_NAMED_QUANTISATION = 1.4
 """Quantisation noise, relative to the declared noise, above which a converter is named."""
-_EXCITED = 3.0
+_EXCITED_RMS = 3.0
 """RMS of an acceleration, relative to the declared noise, above which the road excites the truck:
 12 on a road fifty times smoother than class A, 1.7 on a flat one."""
-_STIFFER = 1.5
+_IMPLAUSIBLE_RATIO = 1.5
 """Ratio of an element's EI to its nominal value, and to the other elements, that only wrong signals
 exceed. Ageing and an inaccurate nominal value change it by less."""
-_CLEARLY = 0.025
-"""Quantile of the draws that must exceed `_STIFFER`."""
+_LOW_QUANTILE = 0.025
+"""Quantile of the draws that must exceed `_IMPLAUSIBLE_RATIO`."""
 _UNDECLARED, _PLAINLY_UNDECLARED = 0.12, 0.3
 _REAR_OVER_FRONT = 2.5
 """Unexplained part of the rear body's motion, alone and relative to the front's. Sixteen
@@ -99,7 +99,7 @@ loads make the effect of the road indistinguishable from that of the bridge."""
 _LARGEST_PAVEMENT_RATIO = 6.0
 """Largest tolerated mismatch on the bridge over that off it, 2.5 standard deviations of its prior:
 decks were up to 3.8 times as rough as the road before them."""
-_UNINFORMED = 0.8
+_UNINFORMATIVE_SPREAD = 0.8
 """Posterior spread of the best-known element, relative to its prior, above which the crossing was
 uninformative."""
 
@@ -107,7 +107,7 @@ ROAD, BODY_FRONT, BODY_REAR = range(3)
 BEFORE, ON, AFTER = range(3)
 
 
-class Fit(NamedTuple):
+class FitDiagnostics(NamedTuple):
     """Residuals and implied corrections of a fit by method `pre`."""
 
     white: Floats
@@ -115,7 +115,7 @@ class Fit(NamedTuple):
     one for the noise that the site file declares; not inflated."""
     step_s: float
     """Time between residuals."""
-    place_m: Floats
+    chainage_m: Floats
     """Chainage (m,) at which a residual compares the profiles: the rear axle's at the middle of the
     filter."""
     chi2_per_dof: float
@@ -146,10 +146,10 @@ class Fit(NamedTuple):
     """Friction of a tandem's springs over their load, where they do not share it."""
 
 
-def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
+def reasons_after_fit(data: CrossingData, fit: FitDiagnostics) -> list[Reason]:
     """Return the reasons not to trust a fit, the most significant first; none if it is reliable."""
     reasons = [Reason.TANDEM_FRICTION] if fit.tandem_friction > _TANDEM_FRICTION else []
-    reasons += _of_the_rows(data, fit)
+    reasons += _residual_reasons(data, fit)
     is_unexplained = bool({Reason.MODEL_MISFIT, Reason.RESIDUALS_COLOURED} & set(reasons))
     if fit.off_bridge_m < SHORTEST_APPROACH_M and (fit.has_mismatch or is_unexplained):
         reasons.append(Reason.APPROACH_TOO_SHORT)
@@ -165,9 +165,9 @@ def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
         reasons.append(Reason.POSITION_INCONSISTENT)
     if _speeds_differ(data, fit):
         reasons.append(Reason.SPEED_INCONSISTENT)
-    if fit.coherence > _COMMON:
+    if fit.coherence > _LARGEST_COHERENCE:
         reasons.append(Reason.COMMON_DISTURBANCE)
-    if fit.rigidity_spread.min() > _UNINFORMED and loads_are_alike(data.vehicle):
+    if fit.rigidity_spread.min() > _UNINFORMATIVE_SPREAD and loads_are_alike(data.vehicle):
         reasons.append(Reason.AXLES_ALIKE)
     return reasons
 
@@ -186,7 +186,7 @@ def coarse_converters(
     for name, density, values in zip(names, density_ug_per_rthz, acceleration, strict=True):
         step = converter_step(values)
         declared = density * MICRO_G_M_PER_S2 * np.sqrt(0.5 / step_s)
-        if step / np.sqrt(12.0) > _COARSE * declared:
+        if step / np.sqrt(12.0) > _NAMED_QUANTISATION * declared:
             found.append(f"{name} in steps of {step:.2g} m/s²")
     return ", ".join(found)
 
@@ -200,7 +200,7 @@ def weak_excitation(
     """
     declared = np.array(density_ug_per_rthz) * MICRO_G_M_PER_S2 * np.sqrt(0.5 / step_s)
     largest = float(np.max(np.std(acceleration, axis=1) / np.maximum(declared, 1e-12)))
-    if largest > _EXCITED:
+    if largest > _EXCITED_RMS:
         return ""
     return (
         f"but the RMS of all accelerations is at most {largest:.2g} times the sensors' noise: the "
@@ -209,11 +209,11 @@ def weak_excitation(
     )
 
 
-def _speeds_differ(data: CrossingData, fit: Fit) -> bool:
+def _speeds_differ(data: CrossingData, fit: FitDiagnostics) -> bool:
     """Return whether the receiver's speeds contradict its positions or the fit."""
     stay, time_s = data.stay, data.fixes.time_s
-    around = (time_s > stay.entry_s - _RECEIVER_ASIDE_S) & (
-        time_s < stay.exit_s + _RECEIVER_ASIDE_S
+    around = (time_s > stay.entry_s - _COMPARED_FIXES_S) & (
+        time_s < stay.exit_s + _COMPARED_FIXES_S
     )
     count = int(np.count_nonzero(around))
     bias = abs(fit.speed_bias)
@@ -229,7 +229,7 @@ def _speeds_differ(data: CrossingData, fit: Fit) -> bool:
     return bool(abs(scale) > _LARGEST_SPEED_SCALE_Z * np.hypot(spread, _SPEED_SCALE_SPREAD))
 
 
-def steps_of_channels(names: tuple[str, ...], fit: Fit) -> dict[Reason, str]:
+def steps_of_channels(names: tuple[str, ...], fit: FitDiagnostics) -> dict[Reason, str]:
     """Return the reason and the channel's name where a channel's delay or gain changes.
 
     The fit has spread the step over truck and bridge, so none of its numbers can be used.
@@ -250,30 +250,32 @@ def steps_of_channels(names: tuple[str, ...], fit: Fit) -> dict[Reason, str]:
 def stiffer_elements(ratio: Floats) -> list[int]:
     """Return the elements whose draws (k, n) of EI over nominal are implausibly high.
 
-    Such an element exceeds both its nominal value and the median of the others by `_STIFFER`, with
-    a probability of at least 1 - `_CLEARLY`. Low values alone, however low, never make another
-    element implausible.
+    Such an element exceeds both its nominal value and the median of the others by
+    `_IMPLAUSIBLE_RATIO`, with a probability of at least 1 - `_LOW_QUANTILE`. Low values alone,
+    however low, never make another element implausible.
     """
     count = ratio.shape[1]
     if count < 2:
         return []
     clear = [
         min(
-            np.quantile(ratio[:, e], _CLEARLY),
-            np.quantile(ratio[:, e] / np.median(np.delete(ratio, e, axis=1), axis=1), _CLEARLY),
+            np.quantile(ratio[:, e], _LOW_QUANTILE),
+            np.quantile(
+                ratio[:, e] / np.median(np.delete(ratio, e, axis=1), axis=1), _LOW_QUANTILE
+            ),
         )
         for e in range(count)
     ]
-    return [e for e in range(count) if clear[e] > _STIFFER]
+    return [e for e in range(count) if clear[e] > _IMPLAUSIBLE_RATIO]
 
 
-def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
-    stretch = _stretches(data, fit)
-    found = quality.residual_bins(fit.white, stretch, fit.step_s, _BANDS_HZ)
+def _residual_reasons(data: CrossingData, fit: FitDiagnostics) -> list[Reason]:
+    segment = _segments(data, fit)
+    found = quality.residual_bins(fit.white, segment, fit.step_s, _BANDS_HZ)
     suspicious = {
         key: cell
         for key, cell in found.items()
-        if quality.bin_excess(cell, _slack(fit, *key)) > _FALSE_ALARM_Z
+        if quality.bin_excess(cell, _tolerated_power(fit, *key)) > _FALSE_ALARM_Z
     }
     reasons: list[Reason] = []
     if suspicious and _is_only_noise(fit, found):
@@ -288,19 +290,23 @@ def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
     return reasons
 
 
-def _slack(fit: Fit, kind: int, stretch: int, band: int) -> float:
+def _tolerated_power(fit: FitDiagnostics, kind: int, segment: int, band: int) -> float:
     """Return the tolerated power of a residual bin, relative to the expected one."""
-    return _SLACK[band] * (_SLACK_WITH_MISMATCH if fit.has_mismatch and kind == ROAD else 1.0)
+    return _TOLERATED_POWER[band] * (
+        _TOLERATED_WITH_MISMATCH if fit.has_mismatch and kind == ROAD else 1.0
+    )
 
 
-def _stretches(data: CrossingData, fit: Fit) -> NDArray[np.int64]:
+def _segments(data: CrossingData, fit: FitDiagnostics) -> NDArray[np.int64]:
     """Return for each residual (m,) whether it lies before, on or after the bridge."""
     span = data.bridge.span_m
-    travelled = fit.place_m if data.stay.direction > 0 else span - fit.place_m
+    travelled = fit.chainage_m if data.stay.direction > 0 else span - fit.chainage_m
     return np.where(travelled < 0.0, BEFORE, np.where(travelled > span, AFTER, ON)).astype(np.int64)
 
 
-def _is_only_noise(fit: Fit, found: dict[tuple[int, int, int], quality.ResidualBin]) -> bool:
+def _is_only_noise(
+    fit: FitDiagnostics, found: dict[tuple[int, int, int], quality.ResidualBin]
+) -> bool:
     """Return whether noise of more than the declared power alone explains the residuals.
 
     The power is estimated from the highest band, which contains only noise. It may differ between
@@ -314,7 +320,7 @@ def _is_only_noise(fit: Fit, found: dict[tuple[int, int, int], quality.ResidualB
         power = max(noise.mean_square, 1.0)
         powers.append(power)
         for key, cell in parts.items():
-            if quality.bin_excess(cell, power * _slack(fit, *key)) > _FALSE_ALARM_Z:
+            if quality.bin_excess(cell, power * _tolerated_power(fit, *key)) > _FALSE_ALARM_Z:
                 return False
     return max(powers) > _NOISY
 
@@ -325,7 +331,7 @@ def loads_are_alike(vehicle: Vehicle) -> bool:
     return abs(front - rear) < ALIKE_LOADS * (front + rear)
 
 
-def is_biased_by_mismatch(fit: Fit) -> bool:
+def is_biased_by_mismatch(fit: FitDiagnostics) -> bool:
     """Return whether the correction for the mismatch exceeds that of any truck.
 
     None of the fit's numbers can be used then.
@@ -334,17 +340,17 @@ def is_biased_by_mismatch(fit: Fit) -> bool:
 
 
 def undeclared_axles(
-    vehicle: Vehicle, acceleration: Floats, step_s: float, *, is_doubted: bool
+    vehicle: Vehicle, acceleration: Floats, step_s: float, *, has_reasons: bool
 ) -> dict[Reason, str]:
     """Return the reason if an undeclared axle acts on the rear of the body, else nothing.
 
     The body equations are evaluated with the middle readings (4, n). Where other checks have failed
-    (`is_doubted`), a lower threshold holds.
+    (`has_reasons`), a lower threshold holds.
     """
     if vehicle.tandem is not None:  # whose front axle has no reading
         return {}
     front, rear = quality.unexplained_by_axle(acceleration, step_s, *body_constants(vehicle))
-    least = _UNDECLARED if is_doubted else _PLAINLY_UNDECLARED
+    least = _UNDECLARED if has_reasons else _PLAINLY_UNDECLARED
     if rear < max(least, _REAR_OVER_FRONT * front):
         return {}
     return {
@@ -355,7 +361,7 @@ def undeclared_axles(
     }
 
 
-def odd_parameters(fit: Fit) -> str:
+def implausible_parameters(fit: FitDiagnostics) -> str:
     """Return the names of implausible truck parameters, most deviating first, or ""."""
     far = {name: z for name, z in fit.prior_z.items() if abs(z) > LARGEST_PRIOR_Z}
     named = sorted(far, key=lambda name: -abs(far[name]))[:_MAX_NAMED]

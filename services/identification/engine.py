@@ -21,7 +21,7 @@ from services.identification.bridge_state import NOTHING_STORED, FusionSettings
 from services.identification.bridge_states import BridgeStates
 from services.identification.known import CrossingRecord
 from services.identification.methods import window_of
-from services.identification.names import Names
+from services.identification.names import ReportedCrossings
 from services.identification.outputs import (
     EngineOutput,
     FusionTask,
@@ -71,7 +71,7 @@ class Engine:
         has_room: Callable[[], bool] = lambda: True,
     ) -> None:
         self._settings = settings
-        self._names = Names()
+        self._names = ReportedCrossings()
         self._finder = Finder(site, window_of(settings.method), self._names.recognise)
         self._waiting = WaitingCrossings(validations, has_room=has_room)
         self._states = BridgeStates(header, fusing, are_published=publishes_states)

@@ -28,10 +28,10 @@ from services.finding.placed import first_axle, middle_names
 from services.identification.bridge_remarks import FREQUENCY_RATIO, PRIOR_Z
 from services.identification.checks import (
     LARGEST_PRIOR_Z,
-    Fit,
+    FitDiagnostics,
     coarse_converters,
+    implausible_parameters,
     is_biased_by_mismatch,
-    odd_parameters,
     reasons_after_fit,
     steps_of_channels,
     undeclared_axles,
@@ -82,7 +82,7 @@ def reasons_of_fit(
     unexcited = weak_excitation(densities, acceleration, step_s) if slipped else ""
     if unexcited:
         slipped = {reason: f"{text}, {unexcited}" for reason, text in slipped.items()}
-    axles = undeclared_axles(data.vehicle, acceleration, step_s, is_doubted=bool(reasons))
+    axles = undeclared_axles(data.vehicle, acceleration, step_s, has_reasons=bool(reasons))
     coarse = coarse_converters(names, densities, acceleration, step_s)
     if (coarse or found.noise_power > 1.0) and Reason.NOISE_ABOVE_DECLARED not in reasons:
         reasons.insert(0, Reason.NOISE_ABOVE_DECLARED)
@@ -94,7 +94,7 @@ def reasons_of_fit(
         ),
         Reason.NOT_CONVERGED: _ending_of_search(found),
         Reason.NOISE_ABOVE_DECLARED: coarse,
-        Reason.IMPLAUSIBLE_VEHICLE: odd_parameters(fit),
+        Reason.IMPLAUSIBLE_VEHICLE: implausible_parameters(fit),
         Reason.TANDEM_FRICTION: f"about {100.0 * fit.tandem_friction:.2g} % of the springs' load",
     }
     return ReasonsOfFit((*axles, *reasons), about, bool(slipped) or is_biased_by_mismatch(fit))
@@ -176,7 +176,7 @@ def contradictions(
     return found
 
 
-def _fit(data: CrossingData, found: Optimum) -> Fit:
+def _fit(data: CrossingData, found: Optimum) -> FitDiagnostics:
     """Return the input of the checks after the fit."""
     problem, y = found.problem, found.state.y
     where, rows = posterior.layout(problem), problem.rows
@@ -193,7 +193,7 @@ def _fit(data: CrossingData, found: Optimum) -> Fit:
         if row.part == parameters.TRUCK
     }
     _, covariance = normal_approximation(found)
-    return Fit(
+    return FitDiagnostics(
         white,
         rows.every * rows.step_s,
         rear_axle_chainage_m(problem, y),

@@ -46,9 +46,9 @@ class FusedBridge(NamedTuple):
     between_may_be_zero: bool
     tracks: tuple[Track, ...]
     used: tuple[str, ...]
-    left_out: tuple[str, ...]
+    excluded: tuple[str, ...]
     other_model: tuple[str, ...]
-    disagree: bool
+    is_contradictory: bool
 
 
 def stored(
@@ -168,8 +168,8 @@ def fused(
     report("putting crossings together", _COMPARED)
     information = build_joint(parts, priors)
     judged = select_consistent(parts, information, priors)
-    if judged.left_out:
-        parts = [part for part in parts if part.name in judged.agree]
+    if judged.excluded:
+        parts = [part for part in parts if part.name in judged.consistent]
         information = build_joint(parts, priors)
 
     def drawing(stage: str, fraction: float) -> None:
@@ -186,14 +186,14 @@ def fused(
         found.between.ravel(),
         found.between_may_be_zero,
         _tracks(found, vehicles),
-        judged.agree,
-        tuple(sorted([*compared.misattributed, *judged.left_out])),
+        judged.consistent,
+        tuple(sorted([*compared.misattributed, *judged.excluded])),
         tuple(one.crossing_id for one in others),
-        compared.disagree or judged.disagree,
+        compared.is_contradictory or judged.is_contradictory,
     )
 
 
-def part_of(source: Source) -> tuple[FusionInput, BridgePriors]:
+def fusion_input(source: Source) -> tuple[FusionInput, BridgePriors]:
     """Return a crossing as input of the fusion, in its own coordinates."""
     priors = _priors(source.likelihood)
     return _part(source, priors.coordinates), priors

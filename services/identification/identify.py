@@ -28,7 +28,12 @@ from services.identification.methods import METHODS, IdentificationMethod
 from services.identification.paper_method import identify_paper
 from services.identification.pre_method import Keep as Keep
 from services.identification.pre_method import MethodRun, identify_pre
-from services.identification.result_parts import CrossingTimes, Cut, longest_outage_s, rejected
+from services.identification.result_parts import (
+    CrossingSamples,
+    CrossingTimes,
+    longest_outage_s,
+    rejected,
+)
 from services.identification.signal_checks import reasons_before_fit, unmeasured
 
 _log = logging.getLogger(__name__)
@@ -51,7 +56,7 @@ class Identify(Protocol):
 
 SLOWEST_M_PER_S = 3.0
 """Speed below which the wheels are hardly affected by the bridge's stiffness."""
-_JUDGED_ASIDE_S = 1.0
+_JUDGED_MARGIN_S = 1.0
 """Time in s before and after the bridge over which signals are judged, and the thresholds were
 determined."""
 _SLOW_SHARE = 0.4
@@ -76,12 +81,15 @@ def identify(
     entry_s, exit_s = _entry_and_exit(data, trajectory, around)
     passing = CrossingTimes(entry_s, exit_s, _speed_m_per_s(data, entry_s, exit_s))
     reject = partial(rejected, data, settings, passing)
-    reasons = _unusable(data, method, trajectory, entry_s, exit_s)
+    reasons = _rejection_reasons(data, method, trajectory, entry_s, exit_s)
     if reasons or trajectory is None or data.samples is None:
-        about = {Reason.CHANNEL_MISSING: _missing(data), Reason.ROLL_NOT_SEEN: _hidden(data)}
+        about = {
+            Reason.CHANNEL_MISSING: _missing_channels(data),
+            Reason.ROLL_NOT_SEEN: _one_sided_sensors(data),
+        }
         return reject(reasons or [Reason.FAILED], about)
     try:
-        cut = _cut(data, trajectory, data.samples, passing)
+        cut = _crossing_samples(data, trajectory, data.samples, passing)
         if cut is None:
             return reject([Reason.GAP_ON_BRIDGE])
         near = _near(cut, passing, 1.0 / data.samples.rate_hz)
@@ -129,27 +137,27 @@ def is_not_finite(error: Exception) -> bool:
     return isinstance(error, ArithmeticError)
 
 
-def _cut(
+def _crossing_samples(
     data: CrossingData, trajectory: Spline, samples: Samples, passing: CrossingTimes
-) -> Cut | None:
+) -> CrossingSamples | None:
     """Return the unbroken samples around the crossing; None if some are missing in it."""
     time_s = samples.start_s + np.arange(_size(samples)) / samples.rate_hz
-    part = _covered(samples, time_s, passing.entry_s, passing.exit_s)
+    part = _unbroken_samples(samples, time_s, passing.entry_s, passing.exit_s)
     if part is None:
         return None
     motion = motion_at(trajectory, time_s[part], data.stay.direction)
     driving = _driving(time_s[part], motion, passing)
-    return Cut(
+    return CrossingSamples(
         np.stack([samples.channels[name][part][driving] for name in data.vehicle.channels]),
         float(time_s[part][driving][0]),
         Motion(*(values[driving] for values in motion)),
     )
 
 
-def _near(cut: Cut, passing: CrossingTimes, step_s: float) -> slice:
+def _near(cut: CrossingSamples, passing: CrossingTimes, step_s: float) -> slice:
     """Return the samples of the crossing itself, for which the thresholds were determined."""
     time_s = cut.start_s + step_s * np.arange(cut.acceleration.shape[1])
-    edges = (passing.entry_s - _JUDGED_ASIDE_S, passing.exit_s + _JUDGED_ASIDE_S)
+    edges = (passing.entry_s - _JUDGED_MARGIN_S, passing.exit_s + _JUDGED_MARGIN_S)
     first, last = np.searchsorted(time_s, edges)
     return slice(int(first), int(last))
 
@@ -207,7 +215,7 @@ def _speed_m_per_s(data: CrossingData, entry_s: float, exit_s: float) -> float:
     return float(np.median(np.abs(data.fixes.speed_m_per_s[near]))) if near.any() else 0.0
 
 
-def _unusable(
+def _rejection_reasons(
     data: CrossingData,
     method: IdentificationMethod,
     trajectory: Spline | None,
@@ -227,9 +235,9 @@ def _unusable(
             reasons.append(Reason.INCOMPLETE_CROSSING)
         case Passage.THROUGH:
             pass
-    if _missing(data):
+    if _missing_channels(data):
         reasons.append(Reason.CHANNEL_MISSING)
-    if _hidden(data):
+    if _one_sided_sensors(data):
         reasons.append(Reason.ROLL_NOT_SEEN)
     if data.stay.passage is not Passage.THROUGH:
         return reasons
@@ -245,13 +253,13 @@ def _unusable(
     return reasons
 
 
-def _missing(data: CrossingData) -> str:
+def _missing_channels(data: CrossingData) -> str:
     """Return the names of the channels that the truck lacks."""
     there = data.samples.channels if data.samples is not None else {}
     return ", ".join(name for name in data.vehicle.channels if name not in there)
 
 
-def _hidden(data: CrossingData) -> str:
+def _one_sided_sensors(data: CrossingData) -> str:
     """Return the names of the sensors of parts that are measured on one side only."""
     return one_sided_channels(data.vehicle, () if data.samples is None else data.samples.channels)
 
@@ -260,7 +268,9 @@ def _size(samples: Samples) -> int:
     return next(iter(samples.channels.values())).size
 
 
-def _covered(samples: Samples, time_s: Floats, entry_s: float, exit_s: float) -> slice | None:
+def _unbroken_samples(
+    samples: Samples, time_s: Floats, entry_s: float, exit_s: float
+) -> slice | None:
     """Return the unbroken samples around the crossing; None if some are missing in it."""
     first = int(np.searchsorted(time_s, entry_s))
     last = int(np.searchsorted(time_s, exit_s, side="right"))

@@ -8,7 +8,7 @@ from services.finding.crossing_data import CrossingData
 
 _SURE_OF_LANE_M = 0.3
 """Slow error in m above which a receiver determines the lane less precisely than the site."""
-_FARTHEST_ASIDE = 3.0
+_LARGEST_LATERAL_Z = 3.0
 """Standard deviations beyond which receiver and site file refer to different axes."""
 
 
@@ -45,4 +45,4 @@ def agrees_with_lane(bridge: Bridge, lateral_m: float, spread_m: float) -> bool:
     if bridge.lane_offset_m is None:
         return True
     aside_m = abs(abs(lateral_m) - abs(bridge.lane_offset_m))
-    return bool(aside_m <= _FARTHEST_ASIDE * np.hypot(bridge.lane_offset_m_spread, spread_m))
+    return bool(aside_m <= _LARGEST_LATERAL_Z * np.hypot(bridge.lane_offset_m_spread, spread_m))

@@ -7,15 +7,15 @@ from services.finding.crossing_data import CrossingData, Detection
 from services.finding.finder import Name
 from services.identification.known import CrossingRecord, is_stay_of
 
-_Place = tuple[str, str, str]
+_TruckOnBridge = tuple[str, str, str]
 """Realm, vehicle and bridge."""
 
 
-class Names:
+class ReportedCrossings:
     """Crossings that were reported before the finder detected them."""
 
     def __init__(self, known: Iterable[CrossingRecord] = ()) -> None:
-        self._known: dict[_Place, list[CrossingRecord]] = {}
+        self._known: dict[_TruckOnBridge, list[CrossingRecord]] = {}
         for one in known:
             self.add(one)
 

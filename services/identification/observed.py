@@ -6,7 +6,7 @@ import numpy as np
 
 from pre_core.monitoring.observation import Observation, observation
 from schemas.results import CrossingResult
-from services.identification.fusing import part_of
+from services.identification.fusing import fusion_input
 from services.identification.usable import source_of
 
 
@@ -15,7 +15,7 @@ def observation_of(result: CrossingResult) -> Observation | None:
     source = source_of(result)
     if source is None or result.parameters is None:
         return None
-    part, priors = part_of(source)
+    part, priors = fusion_input(source)
     names = [f"EI_{n}" for n in range(1, priors.elements + 1)]
     if not all(name in result.parameters for name in names):
         return None

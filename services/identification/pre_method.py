@@ -40,13 +40,13 @@ from services.identification.footprints import (
 from services.identification.fusing import stored
 from services.identification.lane import lane_factor
 from services.identification.result_parts import (
+    CrossingSamples,
     CrossingTimes,
-    Cut,
     caveats,
     detrended,
+    element_shares,
     header,
     nominal_parameters,
-    part_of_elements,
     rejected,
     road_result,
     summary_of,
@@ -71,7 +71,7 @@ by its square root. A model that fits worse is wrong, unless noise alone explain
 _LARGEST_CHI2 = 25.0
 """Limit where noise alone explains the residuals. Noise of five times the declared comes from
 another sensor, or a broken one, and no measurement supports intervals widened by more."""
-_EVEN = 0.5
+_ABSENCE = 0.5
 """Prior probability that a support has no spring, or that a bearing is rigid."""
 _ROAD_DRAWS = 80
 """Draws from which the road's standard deviation is computed, to 8 %; each costs an evaluation."""
@@ -193,17 +193,17 @@ def absence(bridge: Bridge, row: parameters.ParameterSpec) -> float:
     if not row.may_be_absent:
         return 0.0
     if row.key == "support_rotational_stiffness_nm_per_rad":
-        return {"free": 1.0, "sprung": 0.0}.get(bridge.bearings[row.pair_index], _EVEN)
+        return {"free": 1.0, "sprung": 0.0}.get(bridge.bearings[row.pair_index], _ABSENCE)
     if row.key == "torsional_flexibility_per_n" and bridge.is_lane_off_axis:
         return 0.0
-    return _EVEN
+    return _ABSENCE
 
 
 def identify_pre(
     data: CrossingData,
     settings: IdentificationSettings,
     passing: CrossingTimes,
-    cut: Cut,
+    cut: CrossingSamples,
     run: MethodRun,
 ) -> results.CrossingResult:
     """Return the posterior of one crossing as a result; a fit that explains nothing is rejected."""
@@ -218,7 +218,7 @@ def identify_pre(
             diagnostics=counted | {"seconds": run.elapsed()},
         )
     if found.ending is Termination.NOT_FINITE:
-        named = undeclared_axles(data.vehicle, cut.acceleration, inputs.step_s, is_doubted=True)
+        named = undeclared_axles(data.vehicle, cut.acceleration, inputs.step_s, has_reasons=True)
         return reject([Reason.NOT_FINITE, *named], named)
     diagnostics = _diagnostics_of_search(found)
     against = reasons_of_fit(data, found, cut.acceleration, inputs.step_s)
@@ -405,7 +405,7 @@ def _level(bridge: Bridge, theta: Floats, begin: float, end: float) -> Floats:
 
     `begin` and `end` are fractions of the span.
     """
-    share = part_of_elements(np.array(bridge.lengths_m), begin, end)
+    share = element_shares(np.array(bridge.lengths_m), begin, end)
     ratio = theta[:, parameters.EI_1 :] / np.array(bridge.nominal_flexural_rigidity_nm2)
     return np.asarray(np.exp(np.log(ratio) @ share))
 

@@ -33,7 +33,7 @@ class CrossingTimes(NamedTuple):
     speed_m_per_s: float
 
 
-class Cut(NamedTuple):
+class CrossingSamples(NamedTuple):
     """Samples of a crossing, with the truck's positions at them."""
 
     acceleration: Floats
@@ -42,7 +42,7 @@ class Cut(NamedTuple):
     motion: Motion
 
 
-def part_of_elements(lengths_m: Floats, begin: float, end: float) -> Floats:
+def element_shares(lengths_m: Floats, begin: float, end: float) -> Floats:
     """Return the shares (n,), of sum one, of elements between two fractions of the length."""
     edges = np.concatenate([[0.0], np.cumsum(lengths_m)])
     edges /= edges[-1]

@@ -37,14 +37,14 @@ MAX_UNEXPLAINED = 0.3
 Fault-free: at most 0.10; two channels swapped or one inverted: at least 0.36, and then at most
 0.10 after correction.
 """
-_BETTER = 0.5
+_CLEARLY_LESS = 0.5
 """Ratio of unexplained shares below which another order or sign of channels explains more."""
-_LEAD = 0.6
+_AXLE_CORRELATION = 0.6
 """Correlation of the axles' motions at one chainage.
 
 Fault-free: 0.71 to 0.99 (with the axles swapped: -0.72 to 0.49).
 """
-_FOLLOWS = 0.25
+_TANDEM_CORRELATION = 0.25
 """Correlation of a tandem's axles at one place, and of the body in front with a mass on its springs
 over their road. Axles: fault-free 0.34 to 0.77, swapped -0.30 to 0.15. Body, of 30 drawn crossings:
 0.3 to 0.95, inverted the same below zero. Unexplained share of the bogie's equation: fault-free
@@ -64,7 +64,7 @@ def reasons_before_fit(
     The channels are the vehicle's in their order. Each reason forbids a fit. `motion` is the
     position of the front axle at every sample.
     """
-    broken = _broken(vehicle.channels, acceleration, step_s)
+    broken = _channel_faults(vehicle.channels, acceleration, step_s)
     if broken:
         return broken
     disagreeing = placed.disagreement(vehicle, acceleration, step_s, spreads)
@@ -119,7 +119,7 @@ def of_one_sensor(
     recorded = max(quality.unexplained_by_axle(readings, step_s, *constants))
     if recorded <= MAX_UNEXPLAINED:
         return {}
-    best, found = _BETTER * recorded, dict[Reason, str]()
+    best, found = _CLEARLY_LESS * recorded, dict[Reason, str]()
     names = vehicle.channels
     pairs = combinations(range(len(names)), 2)
     for order in [*((k,) for k in range(len(names))), *pairs]:
@@ -136,7 +136,9 @@ def of_one_sensor(
     return found
 
 
-def _broken(channels: tuple[str, ...], acceleration: Floats, step_s: float) -> dict[Reason, str]:
+def _channel_faults(
+    channels: tuple[str, ...], acceleration: Floats, step_s: float
+) -> dict[Reason, str]:
     """Return the most evident fault of single channels, which also causes the others."""
 
     def those(is_wrong: Callable[[Floats], bool]) -> str:
@@ -152,7 +154,7 @@ def _broken(channels: tuple[str, ...], acceleration: Floats, step_s: float) -> d
     if stuck:
         return {Reason.CHANNEL_STUCK: stuck}
     if quality.smallest_difference(acceleration) < ALIKE:
-        return {Reason.CHANNELS_ALIKE: _alike(channels, acceleration)}
+        return {Reason.CHANNELS_ALIKE: _identical_channels(channels, acceleration)}
     for reason, is_wrong in of_each:
         names = those(is_wrong)
         if names:
@@ -160,7 +162,7 @@ def _broken(channels: tuple[str, ...], acceleration: Floats, step_s: float) -> d
     return {}
 
 
-def _alike(channels: tuple[str, ...], acceleration: Floats) -> str:
+def _identical_channels(channels: tuple[str, ...], acceleration: Floats) -> str:
     """Return the names of channels (m, n) with identical signals."""
     pairs = combinations(range(len(channels)), 2)
     return ", ".join(
@@ -218,7 +220,7 @@ def of_tandem(
 
     recorded = unexplained(readings)
     if recorded > MAX_UNEXPLAINED:
-        best, found = _BETTER * recorded, dict[Reason, str]()
+        best, found = _CLEARLY_LESS * recorded, dict[Reason, str]()
         for k in (1, 2, 3):
             other = readings.copy()
             other[k] *= -1.0
@@ -237,13 +239,13 @@ def of_tandem(
     right, swapped = same_place.axle_correlation(
         readings[2], readings[3], step_s, travelled, tandem.gap_m
     )
-    if swapped > _FOLLOWS and right < 0.5 * swapped:
+    if swapped > _TANDEM_CORRELATION and right < 0.5 * swapped:
         return {Reason.CHANNEL_SWAPPED: f"{names[2]} and {names[3]}"}
     spring = float(constants[0][0]), float(constants[1][0])
     follows = same_place.sprung_correlation(
         readings[0], bogie(readings), step_s, travelled, vehicle.wheelbase_m, spring
     )
-    return {Reason.CHANNEL_INVERTED: names[0]} if follows < -_FOLLOWS else {}
+    return {Reason.CHANNEL_INVERTED: names[0]} if follows < -_TANDEM_CORRELATION else {}
 
 
 def is_saturated(values: Floats) -> bool:
@@ -270,13 +272,13 @@ def order_and_signs(
     found = quality.assign_channels(acceleration, step_s, *body_constants(vehicle))
     if found.recorded > MAX_UNEXPLAINED:
         turned = [
-            reversed_ < _BETTER * upright
+            reversed_ < _CLEARLY_LESS * upright
             for upright, reversed_ in zip(found.upright, found.reversed_, strict=True)
             if upright > MAX_UNEXPLAINED
         ]
         if all(turned) and min(found.reversed_) < found.best:
             return [Reason.CHANNEL_INVERTED]
-        if found.best < _BETTER * found.recorded:
+        if found.best < _CLEARLY_LESS * found.recorded:
             return [Reason.CHANNEL_SWAPPED]
         return []  # another fault, which the fit will show
     travelled = direction * (motion.position_m - motion.position_m[0])
@@ -285,8 +287,8 @@ def order_and_signs(
     right, swapped = same_place.axle_correlation(
         acceleration[2], acceleration[3], step_s, travelled, vehicle.wheelbase_m
     )
-    if right < -_LEAD:
+    if right < -_AXLE_CORRELATION:
         return [Reason.CHANNEL_INVERTED]
-    if swapped > _LEAD > 2.0 * right:
+    if swapped > _AXLE_CORRELATION > 2.0 * right:
         return [Reason.CHANNEL_SWAPPED]
     return []

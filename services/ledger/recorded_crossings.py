@@ -29,7 +29,7 @@ from services.finding.streams import Fixes, device_time_ns
 from services.finding.traffic import UnlistedVehicle
 from services.identification.known import CrossingRecord
 from services.identification.methods import window_of
-from services.identification.names import Names
+from services.identification.names import ReportedCrossings
 from services.identification.outputs import IdentificationTask, Output, crossing_output
 from services.identification.waiting import CrossingFromRecording, pending_of
 from services.recordings.recording import is_being_written, read_messages
@@ -218,7 +218,7 @@ def _decided(
     settings: IdentificationSettings,
 ) -> CrossingFromRecording | None:
     """Return the result of a finder for one stay, from the messages around it."""
-    names = Names(known)
+    names = ReportedCrossings(known)
     finder = Finder(site, window_of(settings.method), names.recognise)
     for one in _fed(finder, sorted(messages, key=_moment)):
         at = one.detection

@@ -23,9 +23,9 @@ from services.common.errors import FailureError
 from services.common.files import replaced_atomically
 from services.identification.bridge_state import (
     NOTHING_STORED,
+    BridgeStateCache,
     FusionSettings,
     RecentCrossings,
-    States,
     add_crossings,
     usable,
 )
@@ -199,7 +199,7 @@ class _EarlierReader:
     """Collected content of the files; of the messages only those needed later."""
 
     def __init__(self, search: str, fusing: FusionSettings) -> None:
-        self._states = States(fusing)
+        self._states = BridgeStateCache(fusing)
         self.log = CrossingLog(search)
         self.published: dict[MessageName, None] = {}
         self.states: dict[Key, Message] = {}

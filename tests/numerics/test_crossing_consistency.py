@@ -32,19 +32,19 @@ def foreign(number: int, change: float) -> FusionInput:
 def test_one_foreign_crossing_among_ten_is_left_out() -> None:
     parts = [*survey(9, 0.0, 1), foreign(9, 0.6)]
     found = judge(parts, PRIORS)
-    assert found.left_out == ("crossing-009",)
-    assert len(found.agree) == 9
-    assert not found.disagree
+    assert found.excluded == ("crossing-009",)
+    assert len(found.consistent) == 9
+    assert not found.is_contradictory
 
 
 def test_two_foreign_ones_too() -> None:
     parts = [foreign(0, -0.4), *survey(10, 0.0, 2)[1:], foreign(10, 0.5)]
-    assert judge(parts, PRIORS).left_out == ("crossing-000", "crossing-010")
+    assert judge(parts, PRIORS).excluded == ("crossing-000", "crossing-010")
 
 
 def test_sound_crossings_stay_also_of_a_bridge_that_changes() -> None:
     left_out = [
-        len(judge(survey(12, tau, seed), PRIORS).left_out)
+        len(judge(survey(12, tau, seed), PRIORS).excluded)
         for tau in (0.0, 0.05)
         for seed in range(25)
     ]
@@ -52,18 +52,18 @@ def test_sound_crossings_stay_also_of_a_bridge_that_changes() -> None:
 
 
 def test_sound_crossings_of_little_information_stay() -> None:
-    left_out = [judge(survey(16, 0.06, seed, 0.005), PRIORS).left_out for seed in range(20)]
+    left_out = [judge(survey(16, 0.06, seed, 0.005), PRIORS).excluded for seed in range(20)]
     assert not any(left_out)
 
 
 def test_one_foreign_crossing_beside_a_bridge_that_changes() -> None:
     parts = [*survey(15, 0.06, 5, 0.005), foreign(15, 0.8)]
-    assert judge(parts, PRIORS).left_out == ("crossing-015",)
+    assert judge(parts, PRIORS).excluded == ("crossing-015",)
 
 
 def test_of_two_that_disagree_none_is_left_out() -> None:
     found = judge([*survey(1, 0.0, 3), foreign(1, 0.8)], PRIORS)
-    assert found.left_out == ()
-    assert found.disagree
-    assert not judge(survey(2, 0.0, 4), PRIORS).disagree
-    assert judge(survey(1, 0.0, 4), PRIORS).agree == ("crossing-000",)
+    assert found.excluded == ()
+    assert found.is_contradictory
+    assert not judge(survey(2, 0.0, 4), PRIORS).is_contradictory
+    assert judge(survey(1, 0.0, 4), PRIORS).consistent == ("crossing-000",)

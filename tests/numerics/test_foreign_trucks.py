@@ -59,7 +59,7 @@ def test_of_two_that_disagree_none_is_named() -> None:
     parts = [by_truck(0, 0.2), by_truck(1, 0.6)]
     assert find_misattributed(parts, PRIORS) == VehicleConsistency((), True)
     half = [by_truck(n, 0.2 if n % 2 else 0.6) for n in range(6)]
-    assert find_misattributed(half, PRIORS).disagree
+    assert find_misattributed(half, PRIORS).is_contradictory
 
 
 def test_trucks_of_two_names_are_two_trucks() -> None:

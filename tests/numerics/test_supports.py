@@ -125,7 +125,7 @@ def test_frequencies_of_a_beam_on_springs(compliance: tuple[float, float], agree
     ours = natural_frequencies_hz(beam, 4)
     for i, known in enumerate(ends_on_springs_hz(compliance, 30.0, 4)):
         name = (
-            f"beam on bearings that give: {compliance[0]:g}, {compliance[1]:g} m/N, f_{i + 1}, Hz"
+            f"beam on compliant bearings: {compliance[0]:g}, {compliance[1]:g} m/N, f_{i + 1}, Hz"
         )
         agree(name, known, float(ours[i]), 1e-5)
 

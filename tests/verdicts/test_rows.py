@@ -13,7 +13,7 @@ from services.finding.crossing_data import CrossingData
 from services.identification.checks import (
     BODY_FRONT,
     ROAD,
-    Fit,
+    FitDiagnostics,
     reasons_after_fit,
     stiffer_elements,
 )
@@ -27,10 +27,10 @@ def crossing(**vehicle: Any) -> CrossingData:
     return steady_crossing(np.empty(0), **vehicle)
 
 
-def fit(white: Floats, **changes: Any) -> Fit:
+def fit(white: Floats, **changes: Any) -> FitDiagnostics:
     place = np.linspace(-15.0, 40.0, white.shape[0])
     chi2 = float(np.mean(white**2))
-    return Fit(
+    return FitDiagnostics(
         white, STEP_S, place, chi2, {"c_s1": 0.3}, 0.1, np.full(7, 0.05), False, 50.0
     )._replace(**changes)
 
@@ -97,7 +97,7 @@ def test_rows_of_a_short_stretch_are_not_overrated() -> None:
     """Ten rows before the bridge: a cell of a few numbers needs much to stand out."""
     place = np.concatenate([np.linspace(-0.5, -0.01, 10), np.linspace(0.0, 30.0, ROWS - 10)])
     alarms = [
-        s for s in range(200) if reasons_after_fit(crossing(), fit(normals(s), place_m=place))
+        s for s in range(200) if reasons_after_fit(crossing(), fit(normals(s), chainage_m=place))
     ]
     assert alarms == []
 

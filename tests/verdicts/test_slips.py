@@ -15,7 +15,7 @@ from schemas.reasons import Reason
 from schemas.signals import CHANNELS
 from services.common.arrays import Floats
 from services.identification import checks, fit_reasons
-from services.identification.checks import Fit
+from services.identification.checks import FitDiagnostics
 from tests.verdicts import faults
 from tests.verdicts.faults import Fault, Truth
 
@@ -93,9 +93,9 @@ def test_flat_road_is_rejected_for_missing_excitation() -> None:
 @pytest.mark.parametrize("rate_hz", [pytest.param(200.0, marks=pytest.mark.slow), 1000.0])
 def test_sound_channels_show_no_step(rate_hz: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Below the threshold by a factor of 1.5 and more."""
-    seen: list[Fit] = []
+    seen: list[FitDiagnostics] = []
 
-    def kept(names: tuple[str, ...], fit: Fit) -> dict[Reason, str]:
+    def kept(names: tuple[str, ...], fit: FitDiagnostics) -> dict[Reason, str]:
         seen.append(fit)
         return real(names, fit)
 
@@ -114,7 +114,9 @@ def test_sound_channels_show_no_step(rate_hz: float, monkeypatch: pytest.MonkeyP
 def test_delay_that_changes_by_less_than_a_sample_is_no_slip(size_s: float, is_named: bool) -> None:
     nothing = np.zeros(1)
     step = slip.Step(slip.DELAY, 0, 1.0, size_s, float(np.sign(size_s)) * 20.0)
-    fit = Fit(np.zeros((1, 3)), 0.01, nothing, 1.6, {}, 0.0, nothing, False, 0.0, step=step)
+    fit = FitDiagnostics(
+        np.zeros((1, 3)), 0.01, nothing, 1.6, {}, 0.0, nothing, False, 0.0, step=step
+    )
     assert bool(checks.steps_of_channels(CHANNELS, fit)) == is_named
 
 

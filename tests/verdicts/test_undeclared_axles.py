@@ -10,25 +10,25 @@ from services.simulation.wide_crossings import WideCase, drive_case, site_of
 from studies.simulation.wide_cases import draw_wide, more_axles
 
 
-def named(case: WideCase, *, is_doubted: bool) -> dict[Reason, str]:
+def named(case: WideCase, *, has_reasons: bool) -> dict[Reason, str]:
     run = drive_case(case, 0).run
     signals = np.stack([run.channels[name] for name in CHANNELS])
     vehicle = site_of(case).vehicles[0]
-    return undeclared_axles(vehicle, signals, 1.0 / run.rate_hz, is_doubted=is_doubted)
+    return undeclared_axles(vehicle, signals, 1.0 / run.rate_hz, has_reasons=has_reasons)
 
 
 @pytest.mark.parametrize("number", [1, 2, 3, 9])
 def test_force_of_an_undeclared_axle_is_named(number: int) -> None:
-    found = named(more_axles(number), is_doubted=False)
+    found = named(more_axles(number), has_reasons=False)
     assert "% of the rear's motion is unexplained" in found[Reason.MORE_AXLES_THAN_DECLARED]
 
 
 @pytest.mark.parametrize("number", [5, 15])
 def test_weaker_sign_counts_where_something_else_is_wrong(number: int) -> None:
-    assert not named(more_axles(number), is_doubted=False)
-    assert named(more_axles(number), is_doubted=True)
+    assert not named(more_axles(number), has_reasons=False)
+    assert named(more_axles(number), has_reasons=True)
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_truck_with_its_declared_axles_is_not_accused(seed: int) -> None:
-    assert not named(draw_wide(seed), is_doubted=True)
+    assert not named(draw_wide(seed), has_reasons=True)

@@ -20,16 +20,16 @@ from schemas.results import (
 from services.cli.main import main
 from services.identification.bridge_state import (
     NOTHING_STORED,
+    BridgeStateCache,
     FusionSettings,
     RecentCrossings,
-    States,
     add_crossings,
-    against,
     state_of,
     usable,
     with_common_shares,
+    with_loss_probability,
 )
-from services.identification.fusing import fused, part_of
+from services.identification.fusing import fused, fusion_input
 from services.identification.usable import Source, source_of
 
 NOMINAL = 1.6e10
@@ -84,7 +84,7 @@ def test_moves_of_single_coordinates_are_directions_too() -> None:
                 "bends": fusion.Bends.model_validate({**terms, **given}),
             }
         )
-        part, _ = part_of(Source("one", "lorry", 1, curved))
+        part, _ = fusion_input(Source("one", "lorry", 1, curved))
         assert part.likelihood.bends is not None
         return part.likelihood.bends.directions
 
@@ -227,7 +227,7 @@ def test_probabilities_of_loss_are_against_a_baseline() -> None:
     assert now.probability_of_loss["EI_1"]["10"] < 0.01
     assert now.finding is not None
     assert "than the baseline" in now.finding
-    derived = against(crossing(20), before).derived
+    derived = with_loss_probability(crossing(20), before).derived
     assert derived is not None
     below = derived.probability_below_90_percent_of_baseline
     assert below is not None
@@ -249,7 +249,7 @@ def test_element_unresolved_in_the_baseline_gets_no_claim() -> None:
     assert "Element 2, 6.0" not in now.finding
     assert "The loss may also be in the adjacent element 2" in now.finding
     assert "The baseline is a suspect measurement" in now.finding
-    derived = against(crossing(20), before).derived
+    derived = with_loss_probability(crossing(20), before).derived
     assert derived is not None
     below = derived.probability_below_90_percent_of_baseline
     assert below is not None
@@ -283,7 +283,7 @@ def test_other_methods_and_older_results_are_not_fused() -> None:
 
 def test_a_state_is_made_anew_only_when_crossings_have_come() -> None:
     """A worker asks for all its bridges after every result."""
-    states = States(NOTHING_STORED)
+    states = BridgeStateCache(NOTHING_STORED)
     counted = add_crossings(
         RecentCrossings(), [one for one in map(usable, [crossing(0), crossing(1)]) if one]
     )
