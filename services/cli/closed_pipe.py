@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from typing import Any, TextIO, cast
 
 
-class OutlivingOutput:
-    """A stream that drops text once its pipe is closed, and is otherwise the given one."""
+class ClosedPipeOutput:
+    """A stream that writes to the given one, and drops text once the pipe is closed."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -45,12 +45,12 @@ def to_null(stream: TextIO) -> None:
 
 
 @contextmanager
-def outliving_output(*, is_needed: bool) -> Iterator[None]:
+def tolerating_closed_pipe(*, is_needed: bool) -> Iterator[None]:
     """Let the block print to a closed pipe; raise BrokenPipeError after it, if it did."""
     if not is_needed:
         yield
         return
-    output = OutlivingOutput(sys.stdout)
+    output = ClosedPipeOutput(sys.stdout)
     before, sys.stdout = sys.stdout, cast(TextIO, output)
     try:
         yield

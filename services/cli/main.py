@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final, NoReturn
 
 from services.cli.announcing import subject_of
-from services.cli.closed_pipe import outliving_output, to_null
+from services.cli.closed_pipe import to_null, tolerating_closed_pipe
 from services.cli.completion import SHELLS, commands_of, completion
 from services.cli.parser import add_command
 from services.cli.parsing import Files, Handler, Parser, add_common, files_of
@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for path, kinds in files.outputs.items():
                 check_kind(path, kinds)
             _warn_of_site(getattr(options, "site", None))
-            with outliving_output(is_needed=bool(files.outputs or files.folders)):
+            with tolerating_closed_pipe(is_needed=bool(files.outputs or files.folders)):
                 code = handler(options)
         sys.stdout.flush()
     except InputError as error:

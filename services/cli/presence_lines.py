@@ -6,7 +6,7 @@ from services.cli.realm_model import RealmModel, ServiceRow
 from services.cli.watch_page import ListenerView, silent_services, silent_trucks
 
 
-class Absent(NamedTuple):
+class Absentees(NamedTuple):
     """Trucks and services that are silent."""
 
     trucks: frozenset[str]
@@ -16,12 +16,16 @@ class Absent(NamedTuple):
     """Whether the connection to the router is lost."""
 
 
-NOTHING_ABSENT: Final = Absent(frozenset(), {}, is_lost=False)
+NOTHING_ABSENT: Final = Absentees(frozenset(), {}, is_lost=False)
 
 
 def presence_lines(
-    before: Absent, model: RealmModel, listening: ListenerView, now_s: float, now_ns: int
-) -> tuple[Absent, list[str]]:
+    before: Absentees,
+    model: RealmModel,
+    listening: ListenerView,
+    now_s: float,
+    now_ns: int,
+) -> tuple[Absentees, list[str]]:
     """Return what is silent now, and a line for each change.
 
     While the connection is lost nothing is known of trucks and services: they are as before.
@@ -38,4 +42,4 @@ def presence_lines(
     # With a new health it has its own line already.
     back = [name for name, row in before.services.items() if model.services.get(name) is row]
     lines += [f"{name} is back" for name in sorted(back) if name not in names]
-    return Absent(trucks, services, is_lost=False), lines
+    return Absentees(trucks, services, is_lost=False), lines

@@ -19,7 +19,7 @@ from services.drives.runs import Run
 from services.drives.tables.findings import Target
 from services.drives.tables.guesses import grouped
 from services.drives.tables.mapping import ImportMap
-from services.drives.tables.reading import Understood, understand
+from services.drives.tables.reading import InterpretedRuns, interpret
 from services.finding.placed import rates_hz
 
 _log = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ _OTHER_FORM = re.compile(
 """Errors of the exact reader for files of another form; in line 2 may be words, such as units."""
 
 
-class HowToRead(NamedTuple):
+class ReadOptions(NamedTuple):
     """Options for files that are not in the form of the contract."""
 
     mapping: ImportMap | None = None
@@ -43,17 +43,17 @@ class HowToRead(NamedTuple):
     """Callback for the number of files read."""
 
 
-AS_WRITTEN = HowToRead()
+AS_WRITTEN = ReadOptions()
 
 
 def csv_runs(
-    sources: Sequence[Path], site: Site, vehicle_id: str, how: HowToRead = AS_WRITTEN
+    sources: Sequence[Path], site: Site, vehicle_id: str, how: ReadOptions = AS_WRITTEN
 ) -> list[Run]:
     """Return the runs of a folder or of a pair of files, axes and gravity as the site declares.
 
     Raise InputError, in one line, if they cannot be read, or only by unconfirmed guesses.
     """
-    found = understood_runs(sources, site, vehicle_id, how)
+    found = interpreted_runs(sources, site, vehicle_id, how)
     conversions = found.conversions()
     if conversions and not how.accepts_guesses:
         shown = "; ".join(conversions[:_MAX_SHOWN])
@@ -70,9 +70,9 @@ def csv_runs(
     return found.runs
 
 
-def understood_runs(
-    sources: Sequence[Path], site: Site, vehicle_id: str, how: HowToRead = AS_WRITTEN
-) -> Understood:
+def interpreted_runs(
+    sources: Sequence[Path], site: Site, vehicle_id: str, how: ReadOptions = AS_WRITTEN
+) -> InterpretedRuns:
     """Return the runs with all guesses, confirmed or not."""
     if len(sources) > 2 or (len(sources) == 2 and any(path.is_dir() for path in sources)):
         raise InputError(
@@ -91,11 +91,11 @@ def understood_runs(
             if not all(path.exists() for path in sources):
                 raise
         else:
-            return Understood(runs, notes_of(runs, site, vehicle), ImportMap())
+            return InterpretedRuns(runs, notes_of(runs, site, vehicle), ImportMap())
     declared = next(iter(rates_hz(site.sensor, vehicle).values()))
     target = Target(site, vehicle, declared, how.zone, how.start, how.is_draft)
     try:
-        found = understand(sources, how.mapping or ImportMap(), target)
+        found = interpret(sources, how.mapping or ImportMap(), target)
         for run in found.runs:
             check_plausible(run, site, None)
     except InputError as error:

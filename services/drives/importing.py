@@ -16,16 +16,16 @@ from services.common.progress import Steps, no_step_progress
 from services.drives.comma2k19 import is_comma2k19, read_comma2k19
 from services.drives.csv_runs import (
     AS_WRITTEN,
-    HowToRead,
+    ReadOptions,
     csv_runs,
     exact_runs,
-    understood_runs,
+    interpreted_runs,
 )
 from services.drives.ros2_recording import is_ros2, messages_of_ros2
 from services.drives.runs import Run, normalised, run_to_messages
 from services.drives.settings import ImportOptions
 from services.drives.tables.mapping import load_map
-from services.drives.tables.reading import Understood
+from services.drives.tables.reading import InterpretedRuns
 from services.finding.placed import middle_sensor, rates_hz
 from services.recordings.writer import write_recording
 
@@ -81,17 +81,17 @@ def import_command(
     )
 
 
-def understood_drive(asked: ImportOptions) -> Understood:
+def interpreted_drive(asked: ImportOptions) -> InterpretedRuns:
     """Return a drive of CSV files as it is read, with all guesses; nothing is written."""
     how = _how_to_read(asked, no_step_progress)._replace(is_draft=True)
     site = load_site(asked.site)
     vehicle_id = vehicle_of(site, str(asked.site), asked.vehicle)
-    return understood_runs(asked.sources, site, vehicle_id, how)
+    return interpreted_runs(asked.sources, site, vehicle_id, how)
 
 
-def _how_to_read(asked: ImportOptions, reading: Steps) -> HowToRead:
+def _how_to_read(asked: ImportOptions, reading: Steps) -> ReadOptions:
     mapping = None if asked.map is None else load_map(asked.map)
-    return HowToRead(mapping, asked.zone, asked.start, asked.yes, reading=reading)
+    return ReadOptions(mapping, asked.zone, asked.start, asked.yes, reading=reading)
 
 
 def _import_ros2(source: Path, drive: _Drive, output: Path, *, force: bool) -> str:
@@ -154,7 +154,7 @@ def normalised_runs(
     site: Site | None,
     site_name: str,
     vehicle_id: str,
-    how: HowToRead = AS_WRITTEN,
+    how: ReadOptions = AS_WRITTEN,
     *,
     checks_rate: bool = True,
 ) -> list[Run]:

@@ -11,7 +11,7 @@ from schemas.site import Site, Vehicle
 from services.common.errors import InputError
 from services.drives.gaps import gap_notes
 from services.drives.runs import Run
-from services.drives.tables import judged
+from services.drives.tables import evidence
 from services.drives.tables.clocks import clock_note
 from services.drives.tables.guesses import Guess
 from services.drives.tables.stamps import LATEST_UNIX_S
@@ -38,15 +38,15 @@ def check_plausible(run: Run, site: Site, vehicle: Vehicle | None = None) -> Non
         )
     if vehicle is not None:
         _check_gravity(run, site, vehicle)
-        ratio = judged.noise_ratio(run.channels, run.rate_hz, site, vehicle)
-        found = judged.unit_by_numbers(run.channels, ratio)
-        if found is None and judged.is_counted(run.channels):
-            raise judged.refuse_counts(run.source)
-        if found is None and judged.is_beyond(run.channels, ratio):
-            raise judged.refuse_unit(run.source, ratio)
+        ratio = evidence.noise_ratio(run.channels, run.rate_hz, site, vehicle)
+        found = evidence.unit_by_numbers(run.channels, ratio)
+        if found is None and evidence.is_counted(run.channels):
+            raise evidence.refuse_counts(run.source)
+        if found is None and evidence.is_beyond(run.channels, ratio):
+            raise evidence.refuse_unit(run.source, ratio)
         if run.accel_time_s[0] > LATEST_UNIX_S:
             raise InputError(f"{run.source}: time_s is after 2066; is it in seconds since 1904?")
-        if any(judged.sentinels(values).any() for values in run.channels.values()):
+        if any(evidence.sentinels(values).any() for values in run.channels.values()):
             raise InputError(
                 f"{run.source}: 9999 or the like stands for missing values; leave such rows out"
             )
@@ -59,9 +59,9 @@ def _check_gravity(run: Run, site: Site, vehicle: Vehicle) -> None:
     sensor = middle_sensor(site.sensor, vehicle)
     signs = dict(zip(CHANNELS, sensor.up, strict=True))
     declared = {
-        name: judged.Gravity(sensor.gravity_included, signs.get(name, 1)) for name in run.channels
+        name: evidence.Gravity(sensor.gravity_included, signs.get(name, 1)) for name in run.channels
     }
-    found = judged.gravity_of(run.channels, declared, run.source)
+    found = evidence.gravity_of(run.channels, declared, run.source)
     for name in run.channels:
         if found[name] != declared[name]:
             mean = float(run.channels[name].mean())
@@ -74,11 +74,11 @@ def _check_gravity(run: Run, site: Site, vehicle: Vehicle) -> None:
 def _check_coordinates(run: Run, site: Site) -> None:
     """Raise InputError where positions are near a bridge in another order, unit or sign only."""
     latitude, longitude = run.gnss.latitude_deg, run.gnss.longitude_deg
-    near = judged.nearest_m(latitude, longitude, site.bridges)
-    if near < judged.NEAR_M:
+    near = evidence.nearest_m(latitude, longitude, site.bridges)
+    if near < evidence.NEAR_M:
         return
-    read = judged.coordinates(latitude, longitude, site, None)
-    if read.distance_m >= judged.NEAR_M:
+    read = evidence.coordinates(latitude, longitude, site, None)
+    if read.distance_m >= evidence.NEAR_M:
         return
     if read.is_swapped:
         problem = "latitude_deg and longitude_deg of its positions are swapped"
@@ -95,12 +95,12 @@ def _check_coordinates(run: Run, site: Site) -> None:
 
 def _check_speed(run: Run) -> None:
     gnss = run.gnss
-    ratio = judged.speed_ratio(
+    ratio = evidence.speed_ratio(
         gnss.latitude_deg, gnss.longitude_deg, gnss.time_s, gnss.speed_m_per_s
     )
     if ratio is None:
         return
-    unit = judged.speed_unit(ratio)
+    unit = evidence.speed_unit(ratio)
     if unit not in (None, "m/s"):
         raise InputError(
             f"{run.source}: speed_mps is {ratio:.2f} times the speed of the positions, which "
@@ -120,8 +120,8 @@ def notes_of(runs: Sequence[Run], site: Site, vehicle: Vehicle) -> list[Guess]:
 
 
 def _strange(run: Run, site: Site) -> Iterator[str]:
-    near_m = judged.nearest_m(run.gnss.latitude_deg, run.gnss.longitude_deg, site.bridges)
-    if near_m > judged.NEAR_M:
+    near_m = evidence.nearest_m(run.gnss.latitude_deg, run.gnss.longitude_deg, site.bridges)
+    if near_m > evidence.NEAR_M:
         yield f"no bridge of the site file is near: the nearest fix is {near_m / 1000:.0f} km away"
     for name, values in run.channels.items():
         if values.size > 1 and float(np.ptp(values)) == 0.0:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _MAX_DEFINITION_CHARACTERS: Final = 65_536
 """Maximum length of a definition, ten times the longest known one with all comments."""
-_MEANS_SOMETHING = "?#%"
+_SPECIAL_CHARACTERS = "?#%"
 """Special characters in the name by which rosbags opens an SQLite file: it would open another."""
 
 
@@ -105,7 +105,7 @@ def _check_file(path: Path) -> None:
     check_ordinary(path)
     if path.suffix != ".db3":
         return
-    if any(character in str(path) for character in _MEANS_SOMETHING):
+    if any(character in str(path) for character in _SPECIAL_CHARACTERS):
         raise InputError(
             f"{path}: cannot be opened, as its path contains ?, # or %; move it to another path"
         )

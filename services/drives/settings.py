@@ -71,5 +71,5 @@ class ImportOptions:
 
     @property
     def writes_no_recording(self) -> bool:
-        """Whether the drive is only shown as it is understood."""
+        """Whether the drive is only shown, as interpreted."""
         return self.preview or self.picture is not None or self.write_map is not None

@@ -14,11 +14,11 @@ def _import(asked: ImportOptions) -> int:
 def _preview(asked: ImportOptions) -> int:
     """Print a drive as it is read; write its map if requested."""
     from services.common.files import write_atomically
-    from services.drives.importing import understood_drive
+    from services.drives.importing import interpreted_drive
     from services.drives.tables.mapping import map_text
     from services.drives.tables.preview import preview_lines
 
-    found = understood_drive(asked)
+    found = interpreted_drive(asked)
     if asked.preview:
         print("\n".join(preview_lines(found, a_console().width)))
     if asked.picture is not None:

@@ -7,9 +7,9 @@ import numpy as np
 from schemas.signals import CHANNELS, MAX_ACCELERATION_M_PER_S2
 from services.common.arrays import Floats
 from services.common.errors import InputError
-from services.drives.tables import judged
+from services.drives.tables import evidence
+from services.drives.tables.evidence import Gravity
 from services.drives.tables.findings import Findings, Target
-from services.drives.tables.judged import Gravity
 from services.drives.tables.mapping import ColumnMap
 from services.drives.tables.parts import TablePart
 from services.drives.tables.units import ACCELERATION, G, unit_of
@@ -41,17 +41,17 @@ def scaled(
     rest = {name: values for name, values in channels.items() if name not in units}
     if rest:
         site, vehicle = target.site, target.vehicle
-        ratio = judged.noise_ratio(rest, rate_hz, site, vehicle)
-        unit = judged.unit_by_numbers(rest, ratio)
+        ratio = evidence.noise_ratio(rest, rate_hz, site, vehicle)
+        unit = evidence.unit_by_numbers(rest, ratio)
         first = owner[next(iter(rest))]
         if unit is None:
-            if judged.is_counted(rest):
-                raise judged.refuse_counts(str(first.sheet.path))
-            if judged.is_beyond(rest, ratio) or all(
+            if evidence.is_counted(rest):
+                raise evidence.refuse_counts(str(first.sheet.path))
+            if evidence.is_beyond(rest, ratio) or all(
                 owner[name].placed[name].why != "exact" for name in rest
             ):
-                raise judged.refuse_unit(str(first.sheet.path), ratio)
-            unit = judged.UnitFound("m/s2", "as their names want it")
+                raise evidence.refuse_unit(str(first.sheet.path), ratio)
+            unit = evidence.UnitEvidence("m/s2", "as their names want it")
         for name in rest:
             units[name] = unit.unit
         if unit.unit != "m/s2":
@@ -89,7 +89,7 @@ def as_declared(
             site[name].up if one.up is None else one.up,
         )
     where = str(next(iter(owner.values())).sheet.path)
-    seen = judged.gravity_of(channels, declared_as, where)
+    seen = evidence.gravity_of(channels, declared_as, where)
     for name, gravity in seen.items():
         part = owner[name]
         one = part.given.columns.get(name, ColumnMap())

@@ -29,14 +29,14 @@ _IN_M_PER_S2: Final = (0.5, 3.0)
 _IN_MG: Final = (60.0, 160.0)
 """Measured noise over the declared one, for accelerations in g, m/s², mg or cm/s².
 
-The least of all channels counts, as wheels drown the noise of theirs.
+The least of all channels counts, as the motion of wheels hides the noise of their sensors.
 """
 _GRAVITIES: Final = (
     ("g", 1.0), ("m/s2", G), ("ft/s2", G / 0.3048), ("cm/s2", 100.0 * G), ("mg", 1000.0),
     ("mm/s2", 1000.0 * G),
 )  # fmt: skip
-_LIVELY_M_PER_S2: Final = 3.0
-_WILD_M_PER_S2: Final = 30.0
+_UNLIKELY_M_PER_S2: Final = 3.0
+_IMPOSSIBLE_M_PER_S2: Final = 30.0
 """Standard deviations of a truck's quietest sensor that are unlikely, and impossible."""
 _SENTINELS: Final = (999.0, 999.9, 9999.0, 9999.9, 99999.0, 32767.0, 32768.0, 99.99, 9999.99)
 """Numbers that loggers write where they have none, of either sign."""
@@ -55,7 +55,7 @@ class Gravity(NamedTuple):
     up: int
 
 
-class UnitFound(NamedTuple):
+class UnitEvidence(NamedTuple):
     """Unit of accelerations, and the evidence for it."""
 
     unit: str
@@ -75,28 +75,28 @@ def noise_ratio(
     return min(ratios) if len(ratios) == len(channels) else None
 
 
-def unit_by_numbers(channels: Mapping[str, Floats], ratio: float | None) -> UnitFound | None:
+def unit_by_numbers(channels: Mapping[str, Floats], ratio: float | None) -> UnitEvidence | None:
     """Return the unit of channels as in the file; None without evidence."""
     means = [abs(float(np.mean(values))) for values in channels.values()]
     shown = f"{np.mean(means):.4g}"
     for unit, size in _GRAVITIES:
         within = 0.009 if size > 100.0 else _GRAVITY_TOLERANCE
         if all(abs(mean / size - 1.0) < within for mean in means):
-            return UnitFound(unit, f"their mean is about {shown}, which is gravity in {unit}")
+            return UnitEvidence(unit, f"their mean is about {shown}, which is gravity in {unit}")
     if ratio is None:
         return None
     if _IN_G[0] <= ratio <= _IN_G[1]:
-        return UnitFound("g", f"their noise is {ratio:.3f} of the declared one, about 1/9.8")
+        return UnitEvidence("g", f"their noise is {ratio:.3f} of the declared one, about 1/9.8")
     if _IN_M_PER_S2[0] <= ratio <= _IN_M_PER_S2[1]:
-        return UnitFound("m/s2", f"their noise is {ratio:.2f} of the declared one")
+        return UnitEvidence("m/s2", f"their noise is {ratio:.2f} of the declared one")
     return None
 
 
 def is_beyond(channels: Mapping[str, Floats], ratio: float | None) -> bool:
     """Return whether channels in m/s² would shake as no truck does, so that the unit is another."""
     quietest = min(float(np.std(values)) for values in channels.values())
-    return quietest > _WILD_M_PER_S2 or (
-        ratio is not None and ratio >= _IN_MG[0] and quietest > _LIVELY_M_PER_S2
+    return quietest > _IMPOSSIBLE_M_PER_S2 or (
+        ratio is not None and ratio >= _IN_MG[0] and quietest > _UNLIKELY_M_PER_S2
     )
 
 
@@ -226,7 +226,7 @@ def speeds_of_positions(latitude: Floats, longitude: Floats, time_s: Floats) -> 
 Angle = Literal["deg", "1e-7 deg", "ddmm", "rad"]
 
 
-class ReadAs(NamedTuple):
+class CoordinateForm(NamedTuple):
     """Interpretation of the columns of latitude and longitude."""
 
     unit: Angle
@@ -251,7 +251,7 @@ def degrees(values: Floats, unit: str) -> Floats:
 
 def coordinates(
     first: Floats, second: Floats, site: Site, unit: Angle | None, *, has_signs: bool = False
-) -> ReadAs:
+) -> CoordinateForm:
     """Return the unit, order and signs by which positions are near a bridge, or as they are.
 
     Signs stay as they are where `has_signs`.
@@ -259,7 +259,9 @@ def coordinates(
     units: tuple[Angle, ...] = ("deg", "1e-7 deg", "ddmm", "rad") if unit is None else (unit,)
     turned = ((1.0, 1.0),) if has_signs else ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
     found = [
-        ReadAs(one, swapped, signs, nearest_m(signs[0] * pair[0], signs[1] * pair[1], site.bridges))
+        CoordinateForm(
+            one, swapped, signs, nearest_m(signs[0] * pair[0], signs[1] * pair[1], site.bridges)
+        )
         for signs in turned
         for swapped in (False, True)
         for one in units

@@ -8,7 +8,7 @@ import numpy as np
 from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.drives.runs import GnssTrack
-from services.drives.tables import judged
+from services.drives.tables import evidence
 from services.drives.tables.findings import Findings, Target
 from services.drives.tables.mapping import ColumnMap
 from services.drives.tables.parts import TablePart
@@ -27,14 +27,14 @@ def track(
     unit: Any = declared_unit.unit
     given = [part.found.columns[name] for name in ("latitude_deg", "longitude_deg")]
     has_signs = any(one.factor is not None or one.side is not None for one in given)
-    read = judged.coordinates(first, second, target.site, unit, has_signs=has_signs)
+    read = evidence.coordinates(first, second, target.site, unit, has_signs=has_signs)
     if read.is_swapped and declared_unit.column is not None:
-        read = judged.coordinates(
+        read = evidence.coordinates(
             first, second, target.site, unit or "deg", has_signs=has_signs
         )._replace(is_swapped=False)
     if read.unit != "deg" and unit is None:
         found.guess(part, f"coordinates are in {read.unit}, which places them near a bridge")
-    latitude, longitude = judged.degrees(first, read.unit), judged.degrees(second, read.unit)
+    latitude, longitude = evidence.degrees(first, read.unit), evidence.degrees(second, read.unit)
     if read.is_swapped:
         latitude, longitude = longitude, latitude
         found.guess(part, "latitude and longitude are swapped, which places them near a bridge")
@@ -69,8 +69,8 @@ def _speed(
         if part.given.speed_from_positions is None:
             found.guess(part, "no speed: slopes of the positions over 2 s are taken")
         found.file(part, speed_from_positions=True)
-        return judged.speeds_of_positions(latitude, longitude, time_s)
-    ratio = judged.speed_ratio(latitude, longitude, time_s, speed)
+        return evidence.speeds_of_positions(latitude, longitude, time_s)
+    ratio = evidence.speed_ratio(latitude, longitude, time_s, speed)
     unit = _speed_unit(part, ratio, found)
     if ratio is not None and abs(ratio * SPEED[unit] - 1.0) > _SPEED_TOLERANCE:
         raise InputError(
@@ -90,7 +90,7 @@ def _speed_unit(part: TablePart, ratio: float | None, found: Findings) -> str:
     if head in SPEED and head != "m/s":
         found.guess(part, f"speed is in {head}, by its header")
         return str(head)
-    unit = None if ratio is None else judged.speed_unit(ratio)
+    unit = None if ratio is None else evidence.speed_unit(ratio)
     if unit is None and head is None and part.placed["speed_mps"].why != "exact":
         seen = "" if ratio is None else f" ({ratio:.2f} times the speed of the positions)"
         raise InputError(

@@ -12,7 +12,7 @@ from services.common.language import utc_second
 from services.common.naming import count_of
 from services.drives.runs import Run, grid_index
 from services.drives.tables.guesses import grouped
-from services.drives.tables.reading import Understood
+from services.drives.tables.reading import InterpretedRuns
 
 _ROWS: Final = 3
 _BARS: Final = "▁▂▃▄▅▆▇█"
@@ -26,7 +26,7 @@ _KINDS: Final = {
 _GAP: Final = 1
 
 
-def preview_lines(found: Understood, width: int) -> list[str]:
+def preview_lines(found: InterpretedRuns, width: int) -> list[str]:
     """Return the lines printed before anything is written, each at most `width` long."""
     lines = [f"{_KINDS[one.kind]}: {one.text}" for one in grouped(found.guesses)]
     if not lines:

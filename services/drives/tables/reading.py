@@ -30,7 +30,7 @@ _NUMBER: Final = re.compile(r"\d+(?=\D*$)")
 _SUFFIXES: Final = (".csv", ".txt", ".tsv", ".dat", ".asc")
 
 
-class Understood(NamedTuple):
+class InterpretedRuns(NamedTuple):
     """Runs, the guesses made to read them, and the complete map."""
 
     runs: list[Run]
@@ -42,7 +42,7 @@ class Understood(NamedTuple):
         return conversions(self.guesses)
 
 
-def understand(sources: Sequence[Path], given: ImportMap, target: Target) -> Understood:
+def interpret(sources: Sequence[Path], given: ImportMap, target: Target) -> InterpretedRuns:
     """Read a folder, or the files of one run; InputError in one line if that is impossible."""
     paths = _files(sources, given)
     guesses: list[Guess] = []
@@ -68,7 +68,7 @@ def understand(sources: Sequence[Path], given: ImportMap, target: Target) -> Und
                 f"{after.source}: begins before {before.source} ends, runs of one truck must "
                 "follow one another: give each its start in [file.time] of a map (--map)"
             )
-    return Understood(runs, list(dict.fromkeys(guesses)), _merged(maps))
+    return InterpretedRuns(runs, list(dict.fromkeys(guesses)), _merged(maps))
 
 
 def _files(sources: Sequence[Path], given: ImportMap) -> list[Path]:

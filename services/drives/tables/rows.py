@@ -8,8 +8,8 @@ import numpy as np
 from services.common.arrays import Floats
 from services.common.errors import InputError
 from services.common.naming import count_of
+from services.drives.tables.evidence import sentinels
 from services.drives.tables.findings import Findings, Target
-from services.drives.tables.judged import sentinels
 from services.drives.tables.mapping import POSITION_COLUMNS
 from services.drives.tables.parts import TablePart
 from services.drives.tables.stamps import kept_rows

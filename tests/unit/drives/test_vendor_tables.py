@@ -16,12 +16,12 @@ from schemas.site import Site
 from schemas.site_file import parse_site
 from services.common.arrays import Floats
 from services.common.errors import InputError
-from services.drives.csv_runs import AS_WRITTEN, HowToRead, csv_runs, understood_runs
+from services.drives.csv_runs import AS_WRITTEN, ReadOptions, csv_runs, interpreted_runs
 from services.drives.runs import Run
 from services.drives.tables.guesses import Guess, grouped
 from services.drives.tables.mapping import ImportMap, load_map, map_text
 from services.drives.tables.preview import preview_lines
-from services.drives.tables.reading import Understood
+from services.drives.tables.reading import InterpretedRuns
 
 Columns = dict[str, Floats]
 
@@ -164,7 +164,7 @@ class Variant(NamedTuple):
     files: Callable[[], dict[str, str | bytes]]
     guessed: str | None = None
     """Words of what has to be confirmed; None: nothing."""
-    how: HowToRead = AS_WRITTEN
+    how: ReadOptions = AS_WRITTEN
     note: str = ""
     """Words of what is said besides."""
     left_out: tuple[slice, ...] = ()
@@ -271,14 +271,14 @@ VARIANTS: dict[str, Variant] = {
             A: table(dates(ACCEL, GERMAN, 2.0), ";", ","),
             P: table(dates(GPS, GERMAN, 2.0), ";", ","),
         },
-        how=HowToRead(zone="Europe/Berlin"),
+        how=ReadOptions(zone="Europe/Berlin"),
     ),
     "dates beside a count from 0": Variant(
         lambda: {
             A: table(counted_from_0(dates(ACCEL, GERMAN, 2.0), "Datum/Uhrzeit"), ";", ","),
             P: table(counted_from_0(dates(GPS, GERMAN, 2.0), "Datum und Zeit"), ";", ","),
         },
-        how=HowToRead(zone="Europe/Berlin"),
+        how=ReadOptions(zone="Europe/Berlin"),
         note="not used: Zeit rel. [s]",
     ),
     "Unix times beside a count from 0": Variant(
@@ -288,7 +288,8 @@ VARIANTS: dict[str, Variant] = {
         lambda: {A: table(dates(ACCEL, ISO + "+01:00", 1.0)), P: table(dates(GPS, ISO + "Z"))}
     ),
     "ISO 8601 without a zone": Variant(
-        lambda: {A: table(dates(ACCEL, ISO)), P: table(dates(GPS, ISO))}, how=HowToRead(zone="UTC")
+        lambda: {A: table(dates(ACCEL, ISO)), P: table(dates(GPS, ISO))},
+        how=ReadOptions(zone="UTC"),
     ),
     "ISO 8601 beside Unix time": Variant(
         lambda: pair(dates(ACCEL, ISO)), "times without a zone are UTC"
@@ -302,29 +303,29 @@ VARIANTS: dict[str, Variant] = {
             }
             | renamed(dates(ACCEL, "%H:%M:%S.%f"), "Uhrzeit", *CHANNELS)
         ),
-        how=HowToRead(zone="+00:00"),
+        how=ReadOptions(zone="+00:00"),
     ),
     "from 0, both": Variant(
         lambda: {
             A: table(with_times(ACCEL, ACCEL["time_s"] - START_S)),
             P: table(with_times(GPS, GPS["time_s"] - START_S)),
         },
-        how=HowToRead(start="2026-09-21T16:13:20+02:00"),
+        how=ReadOptions(start="2026-09-21T16:13:20+02:00"),
         note="times count from the same start",
     ),
     "from 0 beside Unix time": Variant(
         lambda: pair(with_times(ACCEL, ACCEL["time_s"] - START_S)),
-        how=HowToRead(start="2026-09-21 14:13:20", zone="UTC"),
+        how=ReadOptions(start="2026-09-21 14:13:20", zone="UTC"),
     ),
     "milliseconds from 0": Variant(
         lambda: {A: table(with_times(ACCEL, 1e3 * (ACCEL["time_s"] - START_S))), P: table(GPS)},
         "times are start in ms",
-        HowToRead(start=str(START_S)),
+        ReadOptions(start=str(START_S)),
     ),
     "numbers of samples": Variant(
         lambda: pair(with_times(ACCEL, np.arange(3500.0))),
         "times are start in samples",
-        HowToRead(start=str(START_S)),
+        ReadOptions(start=str(START_S)),
     ),
     "milliseconds since 1970": Variant(
         lambda: {
@@ -507,7 +508,7 @@ VARIANTS |= {
             ),
         },
         'sprung_rear is column "Caisse arrière"',
-        HowToRead(zone="Europe/Paris"),
+        ReadOptions(zone="Europe/Paris"),
     ),
     "left front and left rear": Variant(
         lambda: pair(renamed(ACCEL, "Time", "Body_FL", "Body_RL", "Axle_FL", "Axle_RL")),
@@ -552,14 +553,14 @@ VARIANTS |= {
             A: table(dates(ACCEL, "%m/%d/%Y %I:%M:%S.%f %p")),
             P: table(dates(GPS, "%m/%d/%Y %I:%M:%S.%f %p")),
         },
-        how=HowToRead(zone="UTC"),
+        how=ReadOptions(zone="UTC"),
     ),
     "names of months": Variant(
         lambda: {
             A: table(dates(ACCEL, "%d-%b-%Y %H:%M:%S.%f")),
             P: table(dates(GPS, "%d. %B %Y %H:%M:%S.%f")),
         },
-        how=HowToRead(zone="UTC"),
+        how=ReadOptions(zone="UTC"),
     ),
     "dates without separators": Variant(
         lambda: {
@@ -586,7 +587,7 @@ VARIANTS |= {
     ),
     "times of day": Variant(
         lambda: {A: table(dates(ACCEL, "%H:%M:%S.%f")), P: table(dates(GPS, "%H:%M:%S.%f"))},
-        how=HowToRead(start="2026-09-21", zone="UTC"),
+        how=ReadOptions(start="2026-09-21", zone="UTC"),
     ),
     "hours, minutes and seconds from 0": Variant(
         lambda: {
@@ -595,7 +596,7 @@ VARIANTS |= {
             )
             for name, columns in ((A, ACCEL), (P, GPS))
         },
-        how=HowToRead(start=str(START_S)),
+        how=ReadOptions(start=str(START_S)),
     ),
     "days of MATLAB": Variant(
         lambda: pair(per_row(ACCEL, "time_s", lambda s: f"{s / 86_400 + 719_529:.12f}")),
@@ -739,7 +740,7 @@ def test_vendor_table_gives_the_samples_of_the_exact_file(name: str, tmp_path: P
     variant = VARIANTS[name]
     site = site_of(*variant.site)
     folder = written(tmp_path / "drive", variant.files())
-    found = understood_runs([folder], site, "truck-x", variant.how)
+    found = interpreted_runs([folder], site, "truck-x", variant.how)
     (run,) = found.runs
     check(run, variant, site)
     output = [guess.text for guess in found.guesses]
@@ -772,22 +773,22 @@ def test_written_map_reads_the_same_without_a_guess(name: str, tmp_path: Path) -
     site = site_of(*variant.site)
     folder = written(tmp_path / "drive", variant.files())
     path = tmp_path / "map.toml"
-    path.write_text(map_text(understood_runs([folder], site, "truck-x", variant.how).mapping))
-    again = understood_runs([folder], site, "truck-x", HowToRead(load_map(path)))
+    path.write_text(map_text(interpreted_runs([folder], site, "truck-x", variant.how).mapping))
+    again = interpreted_runs([folder], site, "truck-x", ReadOptions(load_map(path)))
     assert again.conversions() == []
     check(again.runs[0], variant, site)
     assert map_text(again.mapping) == path.read_text()
-    check(csv_runs([folder], site, "truck-x", HowToRead(load_map(path)))[0], variant, site)
+    check(csv_runs([folder], site, "truck-x", ReadOptions(load_map(path)))[0], variant, site)
 
 
 def test_map_of_several_runs_names_files_by_patterns(tmp_path: Path) -> None:
     site = site_of()
     folder = written(tmp_path / "drive", two_runs())
-    found = understood_runs([folder], site, "truck-x")
+    found = interpreted_runs([folder], site, "truck-x")
     assert [run.accel_time_s.size for run in found.runs] == [1750, 1700]
     assert [file.name for file in found.mapping.files] == ["gnss_*.csv", "log_*.csv"]
     assert all(file.run is None for file in found.mapping.files)
-    again = understood_runs([folder], site, "truck-x", HowToRead(found.mapping))
+    again = interpreted_runs([folder], site, "truck-x", ReadOptions(found.mapping))
     for one, other in zip(found.runs, again.runs, strict=True):
         assert np.array_equal(one.accel_time_s, other.accel_time_s)
 
@@ -991,7 +992,7 @@ def test_map_skips_a_file_that_is_no_part_of_the_drive(tmp_path: Path) -> None:
     path = tmp_path / "map.toml"
     path.write_text('[[file]]\nname = "summary.csv"\nskip = true\n')
     check(
-        csv_runs([folder], site_of(), "truck-x", HowToRead(load_map(path)))[0],
+        csv_runs([folder], site_of(), "truck-x", ReadOptions(load_map(path)))[0],
         VARIANTS["exact"],
         site_of(),
     )
@@ -1005,12 +1006,12 @@ def test_map_that_names_one_key_leaves_the_rest_to_guesses(tmp_path: Path) -> No
     keys = "\n".join(f'{name} = {{ unit = "mg" }}' for name in CHANNELS)
     path.write_text(f'[[file]]\nname = "accel_*.csv"\n[file.columns]\n{keys}\n')
     with pytest.raises(InputError, match="by their names"):
-        csv_runs([folder], site_of(), "truck-x", HowToRead(load_map(path)))
+        csv_runs([folder], site_of(), "truck-x", ReadOptions(load_map(path)))
 
 
-def outcome(folder: Path) -> Understood | str:
+def outcome(folder: Path) -> InterpretedRuns | str:
     try:
-        return understood_runs([folder], site_of(), "truck-x")
+        return interpreted_runs([folder], site_of(), "truck-x")
     except InputError as error:
         return str(error)
 
@@ -1037,7 +1038,7 @@ def test_any_text_in_a_table_is_a_run_or_one_line(
 
 def test_preview_shows_guesses_rows_and_curves(tmp_path: Path) -> None:
     folder = written(tmp_path / "drive", VARIANTS["in g with gravity"].files())
-    found = understood_runs([folder], site_of(), "truck-x")
+    found = interpreted_runs([folder], site_of(), "truck-x")
     lines = preview_lines(found, 90)
     assert (
         lines[0]
@@ -1064,7 +1065,7 @@ def test_uncalibrated_columns_are_read_by_a_factor(tmp_path: Path) -> None:
         for channel, name in zip(CHANNELS, BODY, strict=True)
     )
     path.write_text(f'[[file]]\nname = "accel_*.csv"\n[file.columns]\n{keys}\n')
-    how = HowToRead(load_map(path))
+    how = ReadOptions(load_map(path))
     check(csv_runs([folder], site_of(), "truck-x", how)[0], VARIANTS["exact"], site_of())
 
 
@@ -1090,10 +1091,10 @@ def test_uncalibrated_columns_are_read_by_a_factor(tmp_path: Path) -> None:
 def test_strange_drive_is_noted_and_read(
     files: Callable[[], dict[str, str | bytes]], words: str, tmp_path: Path
 ) -> None:
-    found = understood_runs([written(tmp_path / "drive", files())], site_of(), "truck-x")
+    found = interpreted_runs([written(tmp_path / "drive", files())], site_of(), "truck-x")
     assert len(found.runs) == 1
     assert any(words in guess.text for guess in found.guesses)
-    plain = understood_runs([written(tmp_path / "plain", pair())], site_of(), "truck-x")
+    plain = interpreted_runs([written(tmp_path / "plain", pair())], site_of(), "truck-x")
     assert plain.guesses == []
 
 
@@ -1134,6 +1135,6 @@ def test_equal_guesses_of_several_files_are_one_and_units_come_first() -> None:
         "A_1.csv and 2 more",
         "P_1.csv",
     ]
-    found = Understood([], guesses, ImportMap()).conversions()
+    found = InterpretedRuns([], guesses, ImportMap()).conversions()
     assert found[0] == f"A_1.csv and 2 more: {units}"
     assert len(found) == 2
