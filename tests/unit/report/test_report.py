@@ -975,7 +975,7 @@ def test_of_a_rejected_crossing_stands_what_to_do_next(site: Site) -> None:
         ("log_normal", "torsion declared the lane is off the axis, so the deck twists"),
         (
             "half_normal",
-            "torsion 100 % probability that the deck twists under this lane; 50 %: not determined",
+            "torsion 100 % probability that loads in this lane twist the deck",
         ),
     ],
 )
