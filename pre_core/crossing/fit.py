@@ -148,17 +148,15 @@ def _descend(
     directions: FloatArray,
     temperature: float,
     steps: int,
-    min_improvement: float,
+    tolerance: float,
     is_free: bool = False,
 ) -> tuple[FloatArray, levenberg_marquardt.LMState, Termination, int]:
-    """Minimise along `directions` (f, d) from y until a step improves too little."""
+    """Minimise along `directions` (f, d) from y until a step improves by less than `tolerance`."""
     rows = tempered_residuals(problem, y, directions, temperature)
     start = np.zeros(directions.shape[1])
     lower = lower_bounds(problem, y, directions, is_free=is_free)
     misfit = _CLEAR_MISFIT if problem.force.any() else np.inf
-    found = minimise(
-        rows, start, steps, min_improvement, lower, updates_jacobian=is_free, misfit=misfit
-    )
+    found = minimise(rows, start, steps, tolerance, lower, uses_broyden=is_free, misfit=misfit)
     return y + directions @ found.state.y, found.state, found.ending, evaluations_of(found)
 
 
@@ -342,7 +340,7 @@ def _fit_in_noise_rounds(
     `refresh_noise` estimates it: without mismatch after each of at most `rounds` fits, with
     mismatch before every step (`_fit_in_noise_steps`).
     """
-    temperature, steps, min_improvement = _FREE_STAGES[-1]
+    temperature, steps, tolerance = _FREE_STAGES[-1]
     evaluations = 0
     if problem.mismatch.level_m3.any():
         for most in (_EARLY_STEPS,) if is_free else (_MAX_STEPS, _MORE_STEPS):
@@ -358,7 +356,7 @@ def _fit_in_noise_rounds(
     chi2 = np.inf
     for _ in range(rounds):
         y, _, ending, used = _descend(
-            problem, y, directions, temperature, steps, min_improvement, is_free=is_free
+            problem, y, directions, temperature, steps, tolerance, is_free=is_free
         )
         evaluations += used
         last_chi2, chi2 = chi2, chi2_per_dof(problem, y)
@@ -379,19 +377,18 @@ def fit_stage(
     stage: tuple[float, int, float],
     refresh_noise: RefreshNoise,
 ) -> tuple[PosteriorProblem, FloatArray, Termination, int]:
-    """Fit along directions (f, d) before the last stage.
+    """Fit along directions (f, d) in one stage before the last.
 
-    `stage` has temperature, steps and the least improvement of a step. Return problem, y,
-    termination and number of evaluations. With mismatch the noise is estimated by `refresh_noise`
-    before every step.
+    Return problem, y, termination and number of evaluations. With mismatch `refresh_noise`
+    estimates the noise before every step. `stage`: temperature, steps, `tolerance` of `_descend`.
     """
-    temperature, steps, min_improvement = stage
+    temperature, steps, tolerance = stage
     if problem.mismatch.level_m3.any():
         return _fit_in_noise_steps(
             problem, y, directions, temperature, steps, refresh_noise, is_free=True
         )
     y, _, ending, used = _descend(
-        problem, y, directions, temperature, steps, min_improvement, is_free=True
+        problem, y, directions, temperature, steps, tolerance, is_free=True
     )
     return problem, y, ending, used
 

@@ -226,6 +226,6 @@ class _ContinuedFit:
             low = dct(rows[:, : self._data : RESIDUALS], axis=1, norm="ortho")[:, :waves]
             return np.hstack([low, rows[:, self._data :]])
 
-        found = minimise(residuals, u, steps, ENOUGH, self._at.lower, updates_jacobian=True)
+        found = minimise(residuals, u, steps, ENOUGH, self._at.lower, uses_broyden=True)
         self.evaluations += evaluations_of(found)
         return found.state.y, found.state.objective

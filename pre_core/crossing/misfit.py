@@ -86,7 +86,7 @@ def _fit_once(problem: PosteriorProblem, y: FloatArray) -> OffBridgeFit:
         values = all_rows(problem, y + v @ free.T)
         return np.concatenate([values[:, data], values[:, count:]], axis=1)
 
-    there = minimise(rows, np.zeros(free.shape[1]), _STEPS, _IMPROVEMENT, updates_jacobian=True)
+    there = minimise(rows, np.zeros(free.shape[1]), _STEPS, _IMPROVEMENT, uses_broyden=True)
     stride = chi2_stride(problem)
     white = there.state.residual[: data.size : stride]
     chi2 = float(white @ white) / max(1.0, white.size - free.shape[1] / stride)

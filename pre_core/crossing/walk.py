@@ -91,7 +91,7 @@ def _local_fit(problem: PosteriorProblem, y: FloatArray, strategy: SearchStrateg
 
         lower = lower_bounds(problem, moved, free[:, indices], is_free=True)
         found = minimise(
-            projected, start, _WALK_STEPS, _WALK_MIN_IMPROVEMENT, lower, updates_jacobian=True
+            projected, start, _WALK_STEPS, _WALK_MIN_IMPROVEMENT, lower, uses_broyden=True
         )
         place = Placement(found.state.objective, shift, found.state.y, indices)
         return place, evaluations_of(found)

@@ -264,7 +264,7 @@ def minimise(
     min_improvement: float,
     lower: FloatArray | None = None,
     *,
-    updates_jacobian: bool = False,
+    uses_broyden: bool = False,
     misfit: float = np.inf,
 ) -> SearchResult[LMState, LMInfo]:
     """Return the minimum near `start` (f,), after at most `steps` steps.
@@ -272,14 +272,14 @@ def minimise(
     A step that improves by less than `min_improvement` ends the search at a minimum. Where the mean
     square of the residuals exceeds `misfit`, an improvement by less than a thousandth of the
     objective also ends the search: its exact minimum is not needed. Where no step helps, forward
-    differences have reached their rounding, which counts as a minimum. With `updates_jacobian` the
+    differences have reached their rounding, which counts as a minimum. With `uses_broyden` the
     Jacobian is computed at the start, and then only where updates (`_broyden_step`) fail. A step
     that improves too little ends the search only with a fresh Jacobian. The Jacobian at the end
     need not be fresh (`LMState.is_fresh`). No coordinate goes below `lower` (f,).
     """
 
     def step(state: LMState) -> tuple[LMState, LMInfo]:
-        following, info = (_broyden_step if updates_jacobian else descend)(rows, state, lower)
+        following, info = (_broyden_step if uses_broyden else descend)(rows, state, lower)
         if info.ending is Termination.STUCK:
             return following, info._replace(ending=Termination.CONVERGED)
         is_misfit = following.objective > misfit * state.residual.size

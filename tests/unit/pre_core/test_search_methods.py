@@ -375,7 +375,7 @@ def test_slopes_that_are_led_on_end_at_the_same_bottom_for_less(seed: int) -> No
     start = np.where(np.arange(12) < 2, 0.5, 2.0)
     exact = levenberg_marquardt.minimise(rows, start, 100, 1e-9, lower)
     counted, asked = asked, 0
-    found = levenberg_marquardt.minimise(rows, start, 100, 1e-9, lower, updates_jacobian=True)
+    found = levenberg_marquardt.minimise(rows, start, 100, 1e-9, lower, uses_broyden=True)
     assert found.ending is Termination.CONVERGED
     assert asked == 13 + sum(info.evaluations for info in found.infos)
     assert asked < 0.85 * counted
@@ -385,8 +385,8 @@ def test_slopes_that_are_led_on_end_at_the_same_bottom_for_less(seed: int) -> No
     assert np.all(found.state.y >= lower)
 
 
-@pytest.mark.parametrize("updates_jacobian", [False, True])
-def test_a_point_far_off_is_turned_back_from_without_a_word(updates_jacobian: bool) -> None:
+@pytest.mark.parametrize("uses_broyden", [False, True])
+def test_a_point_far_off_is_turned_back_from_without_a_word(uses_broyden: bool) -> None:
     """Rows so large that their squares are infinite; warnings are errors here."""
 
     def rows(y: np.ndarray) -> np.ndarray:
@@ -395,9 +395,7 @@ def test_a_point_far_off_is_turned_back_from_without_a_word(updates_jacobian: bo
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         start = np.array([0.69, -0.69])
-        found = levenberg_marquardt.minimise(
-            rows, start, 50, 1e-9, updates_jacobian=updates_jacobian
-        )
+        found = levenberg_marquardt.minimise(rows, start, 50, 1e-9, uses_broyden=uses_broyden)
     np.testing.assert_allclose(found.state.y, np.arctanh(0.5), atol=1e-4)
 
 
@@ -449,14 +447,14 @@ def test_a_descent_ends_with_the_first_step_that_gains_too_little() -> None:
     assert gains[-1] < 1.0
 
 
-@pytest.mark.parametrize("updates_jacobian", [False, True])
-def test_a_descent_to_a_misfit_ends_where_a_thousandth_is_gained(updates_jacobian: bool) -> None:
+@pytest.mark.parametrize("uses_broyden", [False, True])
+def test_a_descent_to_a_misfit_ends_where_a_thousandth_is_gained(uses_broyden: bool) -> None:
     def rows(y: np.ndarray) -> np.ndarray:
         return np.column_stack([np.sinh(y[:, 0]), np.full(y.shape[0], 100.0)])
 
     def steps(misfit: float) -> int:
         found = levenberg_marquardt.minimise(
-            rows, np.array([3.0]), 200, 1e-9, updates_jacobian=updates_jacobian, misfit=misfit
+            rows, np.array([3.0]), 200, 1e-9, uses_broyden=uses_broyden, misfit=misfit
         )
         assert found.ending is Termination.CONVERGED
         return len(found.infos)
