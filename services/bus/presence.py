@@ -46,8 +46,8 @@ class Presence:
         self.gone_s: dict[str, float] = {}
         """Steady time in s at which each absent service was found to have left.
 
-        While the connection is lost it says nothing about services. It begins anew with the next
-        one, because services connect again, too.
+        While the connection is lost, it is not updated. With the next connection it starts empty,
+        because services connect again, too.
         """
 
     def look(self, now_s: float) -> None:
