@@ -92,8 +92,8 @@ def _alarms(report: BridgeReport, language: Language) -> Iterator[str]:
 def _inspect(report: BridgeReport, language: Language) -> Iterator[str]:
     """Yield where to inspect: at weak elements, and at neighbours that may have their loss."""
     elements = () if report.view.comparison is None else report.view.comparison.elements
-    beside = report.view.ambiguous_neighbours
-    weak = [one for one in elements if one.is_weak or one.number in beside]
+    adjacent = report.view.ambiguous_neighbours
+    weak = [one for one in elements if one.is_weak or one.number in adjacent]
     places = language.listed(
         [
             language.text(

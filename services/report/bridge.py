@@ -34,7 +34,7 @@ from services.identification.comparison import (
 )
 from services.report.cautions import CautionBasis, cautions
 from services.report.earlier import (
-    Before,
+    EarlierMeasurement,
     NamedResults,
     SurveyFile,
     before_of,
@@ -74,7 +74,7 @@ class BridgeReport(NamedTuple):
     computed_s: float
     """Time at which the computation of the newest results started, s since 1970 UTC."""
     site: Site
-    before: Before | None
+    before: EarlierMeasurement | None
     finding: BridgeFinding
     quality: str
     cautions: tuple[str, ...] = ()
@@ -151,8 +151,8 @@ def _report(
     bridges = {} if state is None else {name: state}
     merged = last.model_copy(update={"crossings": crossings, "bridges": bridges})
     bridge = site.bridge(name)
-    beside = None if site_file is None else site_file.parent
-    before = before_of(bridge, baseline, path, beside)
+    site_folder = None if site_file is None else site_file.parent
+    before = before_of(bridge, baseline, path, site_folder)
     stored = None if before is None else before.estimate
     view = view_of_bridge(bridge, merged, stored)
     used = tuple(crossing for crossing in crossings if crossing.crossing_id in view.used)
@@ -288,7 +288,7 @@ def _range_of(losses: Sequence[float], language: Language) -> str:
     return language.text(key, low=low, high=high)
 
 
-def _other_origin(used: Sequence[CrossingResult], before: Before | None) -> list[str]:
+def _other_origin(used: Sequence[CrossingResult], before: EarlierMeasurement | None) -> list[str]:
     """Return the key of the limit where only the measurement or its baseline was simulated."""
     realms = [{one.realm for one in some} for some in (used, before.crossings if before else ())]
     which = simulated_alone(*realms)

@@ -29,7 +29,7 @@ from services.identification.comparison import (
 )
 from services.identification.comparison import possibly_weak as possibly_less_stiff
 from services.identification.comparison import weak_before as of_baseline
-from services.report.earlier import Before, CombinedSurveys, days_between, season_of
+from services.report.earlier import CombinedSurveys, EarlierMeasurement, days_between, season_of
 from services.report.place import ends_of
 from services.viewer.bridge_view import BridgeView
 
@@ -50,7 +50,7 @@ class CautionBasis(NamedTuple):
     view: BridgeView
     crossings: tuple[CrossingResult, ...]
     """Crossings behind the numbers, in order of time."""
-    before: Before | None
+    before: EarlierMeasurement | None
     combined: CombinedSurveys | None
     validation: tuple[str, ...] = ()
     """Sentences on pairs of truck and bridge without a passed site validation."""
@@ -84,12 +84,12 @@ def possibly_weak(view: BridgeView) -> tuple[Element, ...]:
     return possibly_less_stiff(view.comparison, view.unresolved)
 
 
-def weak_before(view: BridgeView, before: Before | None) -> tuple[Element, ...]:
+def weak_before(view: BridgeView, before: EarlierMeasurement | None) -> tuple[Element, ...]:
     """Return the elements that were clearly less stiff than the others in the baseline."""
     return () if before is None else of_baseline(before.estimate, view.nominal_nm2, view.edges_m)
 
 
-def _alone(view: BridgeView, before: Before | None) -> Comparison | None:
+def _alone(view: BridgeView, before: EarlierMeasurement | None) -> Comparison | None:
     """Return the elements of the baseline, each compared with its others."""
     if before is None:
         return None
@@ -126,8 +126,8 @@ def _implausible(comparison: Comparison, language: Language) -> Iterator[str]:
     numbers = [element.number for element in comparison.implausible]
     if not numbers:
         return
-    beside = {n + side for n in numbers for side in (-1, 1)} - set(numbers)
-    near = [n for n in sorted(beside) if 1 <= n <= len(comparison.elements)]
+    adjacent = {n + side for n in numbers for side in (-1, 1)} - set(numbers)
+    near = [n for n in sorted(adjacent) if 1 <= n <= len(comparison.elements)]
     yield language.text(
         f"caution.implausible.{comparison.reference}",
         elements=named_elements(numbers, language),

@@ -21,7 +21,7 @@ PAUSE_DAYS = 14.0
 _SEASONS = ("winter", "spring", "summer", "autumn")
 
 
-class Before(NamedTuple):
+class EarlierMeasurement(NamedTuple):
     """The earlier measurement that a bridge is compared with."""
 
     name: str
@@ -64,11 +64,13 @@ class CombinedSurveys(NamedTuple):
 
 
 def before_of(
-    bridge: Bridge, given: Path | NamedResults | None, results: Path, beside: Path | None
-) -> Before | None:
+    bridge: Bridge, given: Path | NamedResults | None, results: Path, site_folder: Path | None
+) -> EarlierMeasurement | None:
     """Return the baseline: the given one, or that of the site file."""
     if given is None:
-        given = baseline_path(bridge, beside or results.parent, required=beside is not None)
+        given = baseline_path(
+            bridge, site_folder or results.parent, required=site_folder is not None
+        )
         if given is None:
             return None
     name, stored = given if isinstance(given, tuple) else (given, read_baseline(given))
@@ -78,7 +80,7 @@ def before_of(
     ids = frozenset(state.crossings_used)
     of_bridge = [one for one in stored.crossings if one.bridge == bridge.id]
     excluded = max(state.crossings_left_out_count, len(of_bridge) - len(crossings))
-    return Before(
+    return EarlierMeasurement(
         name.name, estimate_of_state(state), state.verdict or "good", crossings, ids, excluded
     )
 
