@@ -1,7 +1,7 @@
-"""Says what estimates in a recording found: `python decode_estimate.py RESULTS.mcap`.
+"""Print the estimates in a recording: `python decode_estimate.py RESULTS.mcap`.
 
-Knows Protocol Buffers and MCAP only; of this program it takes the messages' definition, from which
-`protoc` makes the same for any language.
+It needs Protocol Buffers and MCAP only. Of this program it uses the definition of the messages, for
+which `protoc` generates code in any language.
 """
 
 import sys
