@@ -126,12 +126,12 @@ def main() -> int:
     p.add_argument("certificates", type=Path, nargs="*")
     options = p.parse_args()
     rng = np.random.default_rng(1)
-    say = partial(Console(soft_wrap=True).print, highlight=False, markup=False)
+    write = partial(Console(soft_wrap=True).print, highlight=False, markup=False)
     if options.certificates:
-        say(measured(options.certificates))
+        write(measured(options.certificates))
         return 0
-    say(f"| {options.elements} elements | passes, correlation 0 | 0.3 | 0.6 | crossings (0.3) |")
-    say("| --- | --- | --- | --- | --- |")
+    write(f"| {options.elements} elements | passes, correlation 0 | 0.3 | 0.6 | crossings (0.3) |")
+    write("| --- | --- | --- | --- | --- |")
     for method in METHODS:
         cells = []
         for correlation in (0.0, 0.3, 0.6):
@@ -141,11 +141,11 @@ def main() -> int:
             cells.append(f"{100.0 * np.mean([passed for passed, _ in found]):.1f} %")
             if correlation == 0.3:
                 crossings = np.mean([number for _, number in found])
-        say(f"| {method.name} | {' | '.join(cells)} | {crossings:.1f} |")
-    say(f"\n| share good | at least {FEWEST_GOOD} of {CROSSINGS} |\n| --- | --- |")
+        write(f"| {method.name} | {' | '.join(cells)} | {crossings:.1f} |")
+    write(f"\n| share good | at least {FEWEST_GOOD} of {CROSSINGS} |\n| --- | --- |")
     for share in (0.95, 0.9, 0.8, 0.7, 0.5, 0.25):
         enough = binom.sf(FEWEST_GOOD - 1, CROSSINGS, share)
-        say(f"| {100.0 * share:.0f} % | {100.0 * enough:.2f} % |")
+        write(f"| {100.0 * share:.0f} % | {100.0 * enough:.2f} % |")
     return 0
 
 

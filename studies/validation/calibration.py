@@ -178,7 +178,7 @@ def in_processes(
 # Statistics of many records
 
 
-class Target(NamedTuple):
+class StudyTarget(NamedTuple):
     """One target: a measured value, and its limits."""
 
     name: str
@@ -269,11 +269,11 @@ def rank_tests(records: list[Record]) -> dict[str, dict[str, statistics.Uniformi
     }
 
 
-def checks(records: list[Record]) -> list[Target]:
+def checks(records: list[Record]) -> list[StudyTarget]:
     """Return the targets of well-specified crossings (docs/validation.md)."""
     s = scores(records)
     if s.seeds.size < 2:
-        return [Target("crossings with numbers", float(s.seeds.size), 2.0, np.inf)]
+        return [StudyTarget("crossings with numbers", float(s.seeds.size), 2.0, np.inf)]
     pooled = statistics.pooled_share(s.is_covered.astype(np.float64))
     each = s.is_covered.mean(axis=0)
     ratio = float(np.nanmean(s.std_log) / np.nanmean(s.bound))
@@ -281,16 +281,18 @@ def checks(records: list[Record]) -> list[Target]:
     worst = np.maximum(np.abs(s.z), np.abs(s.z_log))[s.is_good]
     tests = rank_tests(records)
     return [
-        Target("pooled coverage", pooled.value, 0.93, 0.97, f"± {pooled.error:.3f}"),
-        Target("coverage of each element, least", float(each.min()), 0.90, 0.99),
-        Target("coverage of each element, most", float(each.max()), 0.90, 0.99),
-        Target("root mean square of z, ln EI", statistics.root_mean_square(s.z_log), 0.9, 1.15),
-        Target("root mean square of z, EI", statistics.root_mean_square(s.z), 0.9, 1.15),
-        Target("mean standard deviation over bound", ratio, 0.0, 1.25),
-        Target("share good", float(good), 0.95, 1.0),
-        Target("largest |z| among good", float(worst.max()) if worst.size else None, 0.0, 5.0),
+        StudyTarget("pooled coverage", pooled.value, 0.93, 0.97, f"± {pooled.error:.3f}"),
+        StudyTarget("coverage of each element, least", float(each.min()), 0.90, 0.99),
+        StudyTarget("coverage of each element, most", float(each.max()), 0.90, 0.99),
+        StudyTarget(
+            "root mean square of z, ln EI", statistics.root_mean_square(s.z_log), 0.9, 1.15
+        ),
+        StudyTarget("root mean square of z, EI", statistics.root_mean_square(s.z), 0.9, 1.15),
+        StudyTarget("mean standard deviation over bound", ratio, 0.0, 1.25),
+        StudyTarget("share good", float(good), 0.95, 1.0),
+        StudyTarget("largest |z| among good", float(worst.max()) if worst.size else None, 0.0, 5.0),
         *(
-            Target(
+            StudyTarget(
                 f"ranks of {group}, p",
                 statistics.bonferroni_p_value(
                     np.array([test.p_value for test in of_group.values()])

@@ -29,7 +29,7 @@ from services.simulation.effects import SURFACE
 from studies.simulation.drive_wide import Width
 from studies.simulation.out_of_model import draw_out_of_model, drive_out_of_model
 from studies.validation.bound import bound_at_truth
-from studies.validation.calibration import Record, Target, in_processes, record
+from studies.validation.calibration import Record, StudyTarget, in_processes, record
 
 KeyT = TypeVar("KeyT")
 _COVERAGE = (0.93, 0.99)
@@ -287,23 +287,23 @@ def _coverage(records: list[Record]) -> float | None:
     return float(np.mean(covered)) if covered else None
 
 
-def effect_checks(records: Sequence[Record]) -> list[Target]:
+def effect_checks(records: Sequence[Record]) -> list[StudyTarget]:
     """Return the targets: no wrong good crossing; with enough of them coverage and no bias."""
     found = []
     for line in lines_of(records):
         if line.largest_z_good is not None:
             found.append(
-                Target(
+                StudyTarget(
                     f"{line.effect}: largest |z| among good", line.largest_z_good, 0.0, _LARGEST_Z
                 )
             )
         if line.crossings >= _FEWEST:
-            found.append(Target(f"{line.effect}: coverage", line.coverage, *_COVERAGE))
+            found.append(StudyTarget(f"{line.effect}: coverage", line.coverage, *_COVERAGE))
             is_pooled = line.worst_mean_z is None
             mean = line.mean_z if is_pooled else line.worst_mean_z
             size = None if mean is None else abs(mean)
             name = "mean z" if is_pooled else "mean z of the worst element"
-            found.append(Target(f"{line.effect}: {name}", size, 0.0, _LARGEST_MEAN_Z))
+            found.append(StudyTarget(f"{line.effect}: {name}", size, 0.0, _LARGEST_MEAN_Z))
     return found
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from schemas.validation_records import METHOD_EDITION
-from studies.validation.calibration import SMALLEST_P, Record, Target, by_condition
+from studies.validation.calibration import SMALLEST_P, Record, StudyTarget, by_condition
 from studies.validation.misspecification import HEADINGS, cells, effect_checks, lines_of
 from studies.validation.uncertainty import (
     JUDGED,
@@ -222,7 +222,7 @@ def _effects_section(records: Sequence[Record]) -> str:
     )
 
 
-def _targets(checks: list[Target]) -> str:
+def _targets(checks: list[StudyTarget]) -> str:
     rows = ["| target | measured | wanted | |", "| --- | --: | --: | --- |"]
     for check in checks:
         measured = "none" if check.measured is None else f"{check.measured:.3g}"
@@ -235,7 +235,7 @@ def _targets(checks: list[Target]) -> str:
     return "\n".join(rows)
 
 
-def _unlisted(in_tables: Sequence[Target]) -> str:
+def _unlisted(in_tables: Sequence[StudyTarget]) -> str:
     """Return how many targets of each effect and simulated run are met; "" without any."""
     all_of = Counter(check.name.split(":")[0] for check in in_tables)
     met_of = Counter(check.name.split(":")[0] for check in in_tables if check.is_met)
@@ -243,7 +243,7 @@ def _unlisted(in_tables: Sequence[Target]) -> str:
     return _UNLISTED.format(met=met) if met else ""
 
 
-def _wanted(check: Target) -> str:
+def _wanted(check: StudyTarget) -> str:
     if check.low == check.high:
         return f"{check.low:g}"
     if check.low == 0.0:

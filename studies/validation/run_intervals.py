@@ -10,7 +10,7 @@ from services.common.progress import steps_bar
 from services.finding.placed import middle_site
 from services.simulation.validation_options import IntervalOptions
 from studies.simulation.truths import default_site
-from studies.validation.calibration import Target, by_condition, ranks_of, scores
+from studies.validation.calibration import StudyTarget, by_condition, ranks_of, scores
 from studies.validation.misspecification import (
     HEADINGS,
     cells,
@@ -98,7 +98,9 @@ def _outcome(asked: IntervalOptions, console: "Console") -> ValidationOutcome:
     return outcome._replace(out_of_model=out_of_model)
 
 
-def print_outcome(console: "Console", outcome: ValidationOutcome, all_checks: list[Target]) -> None:
+def print_outcome(
+    console: "Console", outcome: ValidationOutcome, all_checks: list[StudyTarget]
+) -> None:
     """Print the tables of all parts, at most 80 characters wide, and the targets."""
     from rich.table import Table
 

@@ -34,7 +34,7 @@ from services.simulation.survey_kinds import KINDS, SurveyKind
 from services.simulation.usual_trucks import usual_tandem
 from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
 from studies.simulation.out_of_model import draw_out_of_model
-from studies.validation.calibration import Record, Target
+from studies.validation.calibration import Record, StudyTarget
 from studies.validation.misspecification import completed, identity_of, read_records
 
 SPEED_M_PER_S, _FASTER = 10.0, 0.15
@@ -375,7 +375,7 @@ def _percent(share: float) -> str:
     return f"{100.0 * share:.1f} %"
 
 
-def survey_checks(found: Sequence[FusedSurvey]) -> list[Target]:
+def survey_checks(found: Sequence[FusedSurvey]) -> list[StudyTarget]:
     """Return the targets: calibrated intervals, and no element with a large error."""
     checks = []
     for kind in dict.fromkeys(one.kind for one in found):
@@ -383,6 +383,6 @@ def survey_checks(found: Sequence[FusedSurvey]) -> list[Target]:
         z = np.concatenate([one.z for one in some])
         covered = float(np.mean(np.concatenate([one.inside for one in some])))
         few = len(some) < _FEWEST
-        checks.append(Target(f"{kind}: coverage", covered, 0.85 if few else 0.92, 1.0))
-        checks.append(Target(f"{kind}: largest |z|", float(np.abs(z).max()), 0.0, 4.0))
+        checks.append(StudyTarget(f"{kind}: coverage", covered, 0.85 if few else 0.92, 1.0))
+        checks.append(StudyTarget(f"{kind}: largest |z|", float(np.abs(z).max()), 0.0, 4.0))
     return checks

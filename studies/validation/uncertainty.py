@@ -36,7 +36,7 @@ from studies.paper.tables import of_paper
 from studies.validation.bound import bound_at
 from studies.validation.calibration import (
     Record,
-    Target,
+    StudyTarget,
     checks,
     distribution,
     elements_of,
@@ -228,9 +228,9 @@ def _elements(seen: IdentifiedCrossing, truth: dict[str, float], bound: dict[str
     }
 
 
-def targets(outcome: ValidationOutcome) -> list[Target]:
+def targets(outcome: ValidationOutcome) -> list[StudyTarget]:
     """Return all targets of the parts that were run."""
-    found: list[Target] = []
+    found: list[StudyTarget] = []
     if outcome.drawn:
         found += checks(outcome.drawn)
     if outcome.control:
@@ -241,17 +241,17 @@ def targets(outcome: ValidationOutcome) -> list[Target]:
     return found + effect_checks(outcome.out_of_model)
 
 
-def control_checks(records: list[Record]) -> list[Target]:
+def control_checks(records: list[Record]) -> list[StudyTarget]:
     """Return the targets of the control: half the noise declared, none good, for that reason."""
     good = np.mean([line["verdict"] == "good" for line in records])
     named = np.mean([bool(_NOISE_REASONS & set(line["reasons"])) for line in records])
     return [
-        Target("half the noise: share good", float(good), 0.0, 0.02),
-        Target("half the noise: named as misfit", float(named), 0.95, 1.0),
+        StudyTarget("half the noise: share good", float(good), 0.0, 0.02),
+        StudyTarget("half the noise: named as misfit", float(named), 0.95, 1.0),
     ]
 
 
-def scenario_checks(records: list[Record]) -> list[Target]:
+def scenario_checks(records: list[Record]) -> list[StudyTarget]:
     """Return the targets of scenario 12's weak edge element, and of the largest z of all."""
     found = []
     for line in records:
@@ -262,12 +262,12 @@ def scenario_checks(records: list[Record]) -> list[Target]:
                 if "mean" in element
                 else None
             )
-            found.append(Target("scenario 12: error of EI_7", off, 0.0, _SCENARIO_12_WITHIN))
+            found.append(StudyTarget("scenario 12: error of EI_7", off, 0.0, _SCENARIO_12_WITHIN))
     if records:
         worst = [largest_z(line) for line in records]
         known = [z for z in worst if z is not None]
         value = max(known) if len(known) == len(worst) else None
-        found.append(Target("scenarios: largest |z|", value, 0.0, 5.0))
+        found.append(StudyTarget("scenarios: largest |z|", value, 0.0, 5.0))
     return found
 
 
@@ -277,7 +277,7 @@ def largest_z(line: Record) -> float | None:
     return max(z, default=None)
 
 
-def judged_checks(line: Record) -> list[Target]:
+def judged_checks(line: Record) -> list[StudyTarget]:
     """Return the targets of one run of the independent simulator."""
     tolerance = JUDGED[line["folder"]]
     name = f"{line['folder'].split('_')[0]} run {line['run']}"
@@ -291,10 +291,10 @@ def judged_checks(line: Record) -> list[Target]:
         )
         ratio = max(e["std"] / e["bound"] for e in elements)
     return [
-        Target(f"{name}: error over allowed", over, 0.0, 1.0),
-        Target(f"{name}: std over bound", ratio, 0.0, _LARGEST_STD_OVER_BOUND),
-        Target(f"{name}: chi2", line["chi2_per_dof"], *_JUDGED_CHI2),
-        Target(f"{name}: is good", float(line["verdict"] == "good"), 1.0, 1.0),
+        StudyTarget(f"{name}: error over allowed", over, 0.0, 1.0),
+        StudyTarget(f"{name}: std over bound", ratio, 0.0, _LARGEST_STD_OVER_BOUND),
+        StudyTarget(f"{name}: chi2", line["chi2_per_dof"], *_JUDGED_CHI2),
+        StudyTarget(f"{name}: is good", float(line["verdict"] == "good"), 1.0, 1.0),
     ]
 
 

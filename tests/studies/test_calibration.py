@@ -23,7 +23,7 @@ from studies.simulation.truths import default_site
 from studies.validation import calibration, run_intervals, uncertainty
 from studies.validation.calibration import (
     GROUPS,
-    Target,
+    StudyTarget,
     by_condition,
     checks,
     distribution,
@@ -100,7 +100,7 @@ def made_up(count: int, *, narrow: float = 1.0, shift: float = 0.0) -> list[dict
     return records
 
 
-def missed(found: list[Target]) -> set[str]:
+def missed(found: list[StudyTarget]) -> set[str]:
     return {check.name for check in found if not check.is_met}
 
 
