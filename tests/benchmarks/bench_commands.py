@@ -37,9 +37,9 @@ from tests.benchmarks import cases
 walk = random_walk.problem(cases.paper_window(6), cases.NOMINAL, cases.FREE, seed=1)
 random_walk.step(walk, random_walk.init(walk, 8))
 before = peak_bytes()
-search.run(
+search.run_search(
     partial(random_walk.init, walk), partial(random_walk.step, walk), random_walk.STEPS,
-    at_the_end=search.Ending.STEPS_DONE,
+    at_limit=search.Termination.STEPS_DONE,
 )
 print(json.dumps({"interpreter": bare, "before": before, "whole": peak_bytes()}))
 """
