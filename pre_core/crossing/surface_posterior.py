@@ -25,9 +25,9 @@ from pre_core.crossing.nuisances import (
     Nuisances,
     ResidualParts,
     followed,
-    index_of_offset,
     integrated_residuals,
     nuisances_of,
+    index_of_offset,
 )
 from pre_core.crossing.residual_draws import (
     DrawnDensity,
@@ -59,6 +59,9 @@ _WIDENED = 2.0
 seldom outside, and is where many crossings are linearised in fusion."""
 _WIDER = 1.2
 """The same for the first points of draws by the residuals."""
+_BEYOND_DRAWS = 1.4
+"""Width of the points of a surface in fusion relative to that of the posterior's draws: many
+crossings determine a bridge that is beside the posterior of each."""
 _NEGLIGIBLE = 4.0
 """Log of the ratio of posterior densities beyond which no first points are drawn about a less
 likely bridge: with a fiftieth of the density it shifts no 95 % interval, and draws of both converge
@@ -72,9 +75,8 @@ class ResidualDraws(NamedTuple):
 
     weighted: WeightedDraws  # of the curved coordinates and the offset, (k, n + 1)
     evaluations: int
-    points: FloatArray | None
-    """Points (k, n + 1) for a surface in fusion, about all likely bridges; None for a single
-    one."""
+    points: FloatArray
+    """Points (POINTS, n + 1) for a surface in fusion: draws of the posterior, widened."""
 
 
 class SurfacePosterior(NamedTuple):
@@ -125,8 +127,33 @@ def drawn_by_residuals(
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 25,)))
     weighted = residual_draws(density, first, draws, rng, report)
     evaluations += nuisances.evaluations + 2 * (first.shape[0] + weighted.y.shape[0])
-    points = _points_about_all([found, *rivals], POINTS, inflation, seed) if rivals else None
+    points = _widened(weighted, half_normal, _own_generator(found, seed))
     return ResidualDraws(weighted, evaluations, points)
+
+
+def _own_generator(found: Optimum, seed: int) -> np.random.Generator:
+    """Return a generator for points of this crossing alone.
+
+    Points that crossings have in common would have errors that add up in fusion.
+    """
+    own = (1 << 23, found.problem.noise.reciprocal.size)
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=own))
+
+
+def _widened(
+    weighted: WeightedDraws, half_normal: NDArray[np.int64], rng: np.random.Generator
+) -> FloatArray:
+    """Return POINTS (k, n + 1) of a wider posterior: weighted draws moved from their median.
+
+    A normal about the optimum would lie elsewhere: parabolas that also have to fit there are wrong
+    where the posterior is.
+    """
+    chosen = importance.systematic_resample(weighted.weights.weight, POINTS, rng)
+    points = copula_draws(weighted.y[chosen], POINTS, rng)
+    middle = np.median(points, axis=0)
+    points = middle + _BEYOND_DRAWS * (points - middle)
+    points[:, half_normal] = np.abs(points[:, half_normal])
+    return np.asarray(points)
 
 
 def _likely_rivals(
@@ -176,9 +203,7 @@ def surface_posterior(found: Optimum, inflation: float, seed: int) -> SurfacePos
     wide = draw_curved(found, first.squares, POINTS, seed, widened, may_be_absent=False)
     if not is_enough(wide.weights, POINTS):
         return first._replace(points=_points_of_normal(found, POINTS, widened, seed))
-    # Points that crossings have in common would have errors that add up in fusion.
-    own = (1 << 23, found.problem.noise.reciprocal.size)
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=own))
+    rng = _own_generator(found, seed)
     resampled = wide.y[importance.systematic_resample(wide.weights.weight, POINTS, rng)]
     points = copula_draws(resampled, POINTS, rng)
     second = fitted(points[:POINTS_OF_DRAWS])

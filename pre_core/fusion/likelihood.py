@@ -115,7 +115,7 @@ def likelihood(
         curved = curved_coordinates(found)
         given = given[:, np.append(np.searchsorted(curved, bridge), curved.size)]
         of = nuisances_of(found, problem, state.jacobian, parts, given)
-        surface = response_surface(of, state.jacobian, given, has_step=True)
+        surface = response_surface(of, state.jacobian, given, for_fusion=True)
         bends, linearised = of_surface(surface, posterior.rigidity_spread(problem.priors))
         others = 0
     else:

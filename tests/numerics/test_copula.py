@@ -1,10 +1,14 @@
 """New draws of a distribution: its marginals and rank correlations, nothing repeated."""
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from pre_core.arrays import FloatArray
-from pre_core.crossing.surface_posterior import copula_draws
+from pre_core.crossing.surface_posterior import _BEYOND_DRAWS, _widened, copula_draws
+from pre_core.crossing.response_surface import POINTS
+from pre_core.crossing.weighted_draws import WeightedDraws
+from pre_core.search.importance import SmoothedWeights
 
 
 def ranks(columns: FloatArray) -> NDArray[np.int64]:
@@ -37,3 +41,17 @@ def test_what_is_zero_in_all_draws_stays_zero() -> None:
     new = copula_draws(draws, 300, rng)
     assert not new[:, 1].any()
     assert new[:, 0].std() > 0.5
+
+
+def test_points_of_a_surface_are_a_wider_posterior() -> None:
+    """About its weighted median; what must not be negative is reflected, as a spring's rate."""
+    rng = np.random.default_rng(8)
+    y = np.stack([3.0 + rng.standard_normal(40_000), 0.2 * rng.random(40_000)], axis=1)
+    weight = np.exp(-0.5 * (y[:, 0] - 3.0))  # moves the mean of the normal by -0.5
+    weights = SmoothedWeights(weight / weight.sum(), 0.1, 30_000.0)
+    points = _widened(WeightedDraws(y, weights), np.array([1]), rng)
+    assert points.shape == (POINTS, 2)
+    assert points[:, 0].mean() == pytest.approx(2.5, abs=0.1)
+    assert points[:, 0].std() == pytest.approx(_BEYOND_DRAWS, rel=0.05)
+    assert points[:, 1].min() >= 0.0
+    assert points[:, 1].max() == pytest.approx(0.1 + 0.1 * _BEYOND_DRAWS, rel=0.05)

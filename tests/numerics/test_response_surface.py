@@ -119,9 +119,33 @@ def test_parabolas_are_found_again() -> None:
     first, second = np.triu_indices(4)
     true = rng.standard_normal((5, 1 + 4 + first.size))
     values = true @ np.column_stack([np.ones(200), u, u[:, first] * u[:, second]]).T
-    fitted, error = _fit_parabolas(u, partial(_some_columns, values))
+    fitted, error, remainder = _fit_parabolas(u, partial(_some_columns, values))
     assert np.allclose(fitted, true, atol=2e-3)
     assert np.abs(error).max() < 1e-3
+    assert np.abs(remainder).max() < 1e-2
+
+
+def test_remainder_has_the_covariance_of_what_parabolas_leave() -> None:
+    rng = np.random.default_rng(4)
+    u = rng.standard_normal((16_000, 2))
+    # Hermite polynomials of third order are uncorrelated with parabolas of normal points.
+    third = u[:, 0] ** 3 - 3.0 * u[:, 0]
+    true = rng.standard_normal((6, 6))
+    values = true @ np.column_stack([np.ones(16_000), u, u**2, u[:, 0] * u[:, 1]]).T
+    along = np.array([2.0, 0.0, 1.0, 0.0, 0.0, 0.5])
+    _, _, remainder = _fit_parabolas(u, partial(_some_columns, values + np.outer(along, third)))
+    expected = 6.0 * np.outer(along, along)  # the variance of that polynomial is 3!
+    assert remainder @ remainder.T == pytest.approx(expected, rel=0.3, abs=0.3)
+
+
+def test_remainder_is_noise() -> None:
+    """R'R is the information of the columns with white noise and the remainder's together."""
+    rng = np.random.default_rng(6)
+    columns, noise = rng.standard_normal((30, 5)), rng.standard_normal((30, 7))
+    root = _root_of_squares(columns, np.zeros((2, 2)), noise)
+    covariance = np.eye(30) + noise @ noise.T
+    expected = columns.T @ np.linalg.solve(covariance, columns)
+    np.testing.assert_allclose(root.T @ root, expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -131,9 +155,10 @@ def test_points_without_residuals_do_not_count(value: float) -> None:
     u, values = rng.standard_normal((400, 3)), rng.standard_normal((20, 400))
     impossible = values.copy()
     impossible[7, [3, 170]] = value
-    found = _fit_parabolas(u, partial(_some_columns, impossible))
+    *found, remainder = _fit_parabolas(u, partial(_some_columns, impossible))
+    assert np.isfinite(remainder).all()
     rest = np.delete(np.arange(400), [3, 170])
-    expected = _fit_parabolas(u[rest], partial(_some_columns, values[:, rest]))
+    *expected, _ = _fit_parabolas(u[rest], partial(_some_columns, values[:, rest]))
     for one, other in zip(found, expected, strict=True):
         assert one == pytest.approx(other, rel=1e-9, abs=1e-12)
 
@@ -145,7 +170,7 @@ def test_what_parabolas_do_not_follow_counts_as_no_knowledge() -> None:
     for _ in range(40):
         u = rng.standard_normal((100, 3))
         values = rng.standard_normal((30, 100))
-        fitted, error = _fit_parabolas(u, partial(_some_columns, values))
+        fitted, error, _ = _fit_parabolas(u, partial(_some_columns, values))
         of_fits.append(np.trace(fitted.T @ fitted))
         corrected.append(of_fits[-1] - np.trace(error))
     assert np.mean(of_fits) > 2.0
@@ -155,7 +180,7 @@ def test_what_parabolas_do_not_follow_counts_as_no_knowledge() -> None:
 def test_squares_of_few_rows_are_those_of_all_less_their_error() -> None:
     rng = np.random.default_rng(9)
     columns, error = rng.standard_normal((40, 6)), np.diag([0.5, 1.0, 0.1])
-    few = _root_of_squares(columns, error)
+    few = _root_of_squares(columns, error, np.zeros((40, 0)))
     squares = columns.T @ columns
     squares[:3, :3] -= error
     assert few.shape == (6, 6)
