@@ -19,9 +19,14 @@ from schemas.site import Site
 from schemas.strict_model import Finite, StrictModel
 
 METHOD_EDITION: Final = 14
-"""Version of the results of method `pre`. Raise it with every change that may alter a result;
-earlier validation records become void. It is independent of the program's version, because most
-versions leave the method unchanged and it may change between two versions."""
+"""Version of the crossings' estimates of method `pre`. Raise it with every change that may alter
+values, intervals or verdict of a crossing; earlier validation records become void. It is
+independent of the program's version, because most versions leave the method unchanged and it may
+change between two versions."""
+
+LIKELIHOOD_EDITION: Final = 2
+"""Version of the likelihoods that results keep for fusion. Raise it with every change that may
+alter one; those of earlier versions are still fused."""
 
 LEAST_COVERAGE: Final = 0.85
 """Smallest coverage of all 95 % intervals that passes. Those of one crossing are dependent: see

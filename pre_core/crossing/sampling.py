@@ -20,6 +20,7 @@ from pre_core.crossing.surface_posterior import (
     complete,
     draw_curved,
     drawn_by_residuals,
+    points_about_draws,
     surface_posterior,
 )
 from pre_core.crossing.weighted_draws import (
@@ -182,9 +183,11 @@ def _mismatch_draws(
     weighted = draw_curved(found, of.squares, draws, seed, inflation, report)
     if is_enough(weighted.weights, draws):
         chains = _completed_to_chains(found, weighted, draws, seed, inflation)
+        points = points_about_draws(found, weighted, seed)
     else:
         chains = _compliance_draws(found, draws, seed, inflation)
-    return chains._replace(evaluations=of.evaluations, points=of.points)
+        points = of.points
+    return chains._replace(evaluations=of.evaluations, points=points)
 
 
 def _alike_tyres_draws(
@@ -195,7 +198,8 @@ def _alike_tyres_draws(
     Draws of the normal in c, which can be wrong by six standard deviations here, replace them only
     if hardly any are effective.
     """
-    weighted, evaluations, points = drawn_by_residuals(found, draws, seed, inflation, report)
+    weighted, evaluations = drawn_by_residuals(found, draws, seed, inflation, report)
+    points: FloatArray | None = None
     if weighted.weights.ess < _LEAST_ESS:
         # Diagnostics are of the draws that failed, not of those in their place.
         chains = _compliance_draws(found, draws, seed, inflation)._replace(
@@ -206,6 +210,7 @@ def _alike_tyres_draws(
         )
     else:
         chains = _completed_to_chains(found, weighted, draws, seed, inflation)
+        points = points_about_draws(found, weighted, seed)
     return chains._replace(evaluations=evaluations, points=points)
 
 

@@ -25,9 +25,9 @@ from pre_core.crossing.nuisances import (
     Nuisances,
     ResidualParts,
     followed,
+    index_of_offset,
     integrated_residuals,
     nuisances_of,
-    index_of_offset,
 )
 from pre_core.crossing.residual_draws import (
     DrawnDensity,
@@ -75,8 +75,6 @@ class ResidualDraws(NamedTuple):
 
     weighted: WeightedDraws  # of the curved coordinates and the offset, (k, n + 1)
     evaluations: int
-    points: FloatArray
-    """Points (POINTS, n + 1) for a surface in fusion: draws of the posterior, widened."""
 
 
 class SurfacePosterior(NamedTuple):
@@ -127,8 +125,7 @@ def drawn_by_residuals(
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 25,)))
     weighted = residual_draws(density, first, draws, rng, report)
     evaluations += nuisances.evaluations + 2 * (first.shape[0] + weighted.y.shape[0])
-    points = _widened(weighted, half_normal, _own_generator(found, seed))
-    return ResidualDraws(weighted, evaluations, points)
+    return ResidualDraws(weighted, evaluations)
 
 
 def _own_generator(found: Optimum, seed: int) -> np.random.Generator:
@@ -140,13 +137,24 @@ def _own_generator(found: Optimum, seed: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=own))
 
 
+def points_about_draws(found: Optimum, weighted: WeightedDraws, seed: int) -> FloatArray:
+    """Return points (POINTS, n + 1) for a surface in fusion: a wider posterior than `weighted`.
+
+    Points of a normal about the optimum, or of one twice as wide, lie where the posterior is not:
+    parabolas that also have to fit there are wrong where it is.
+    """
+    half_normal = np.searchsorted(
+        curved_coordinates(found), posterior.layout(found.problem).half_normal
+    )
+    return _widened(weighted, half_normal, _own_generator(found, seed))
+
+
 def _widened(
     weighted: WeightedDraws, half_normal: NDArray[np.int64], rng: np.random.Generator
 ) -> FloatArray:
-    """Return POINTS (k, n + 1) of a wider posterior: weighted draws moved from their median.
+    """Return POINTS (k, n + 1): weighted draws, further from their median.
 
-    A normal about the optimum would lie elsewhere: parabolas that also have to fit there are wrong
-    where the posterior is.
+    Coordinates `half_normal` are reflected at zero.
     """
     chosen = importance.systematic_resample(weighted.weights.weight, POINTS, rng)
     points = copula_draws(weighted.y[chosen], POINTS, rng)

@@ -21,6 +21,7 @@ from pre_core.physics.bridge import Beam
 from schemas.results import BridgeResult, CrossingResult
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Site, Vehicle
+from schemas.validation_records import LIKELIHOOD_EDITION
 from services.common.arrays import Floats
 from services.common.progress import Steps, no_step_progress
 from services.drives.runs import Run
@@ -69,7 +70,7 @@ def one_crossing(
             }
         )
     return {
-        "identity": identity_of(site, settings),
+        "identity": survey_identity(site, settings),
         "effect": kind,
         "seed": survey,
         "number": number,
@@ -77,6 +78,11 @@ def one_crossing(
         "truth": _survey_truth(site, of, survey).tolist(),
         "result": None if crossing is None else crossing.model_dump(mode="json"),
     }
+
+
+def survey_identity(site: Site, settings: IdentificationSettings) -> str:
+    """Return what the crossings of a survey depend on, with their likelihoods for fusion."""
+    return f"{identity_of(site, settings)} {LIKELIHOOD_EDITION}"
 
 
 def _driven(site: Site, of: SurveyKind, survey: int, number: int, truck: int) -> tuple[Run, Site]:
@@ -220,7 +226,7 @@ def run_surveys(
         for number in range(KINDS[kind].crossings)
     ]
     identities = {
-        (kind, truck): identity_of(site_of_truck(site, KINDS[kind], truck), settings)
+        (kind, truck): survey_identity(site_of_truck(site, KINDS[kind], truck), settings)
         for kind in kinds
         for truck in range(len(KINDS[kind].masses_kg))
     }

@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pre_core.arrays import FloatArray
-from pre_core.crossing.surface_posterior import _BEYOND_DRAWS, _widened, copula_draws
 from pre_core.crossing.response_surface import POINTS
+from pre_core.crossing.surface_posterior import _BEYOND_DRAWS, _widened, copula_draws
 from pre_core.crossing.weighted_draws import WeightedDraws
 from pre_core.search.importance import SmoothedWeights
 

@@ -134,7 +134,7 @@ def test_what_was_driven_is_not_driven_again(
         assert isinstance(settings, IdentificationSettings)
         driven.append((kind, survey, number))
         of = surveys.site_of_truck(default_site(), KINDS[kind], 0)
-        return record(kind, survey, number) | {"identity": surveys.identity_of(of, settings)}
+        return record(kind, survey, number) | {"identity": surveys.survey_identity(of, settings)}
 
     monkeypatch.setattr(surveys, "one_crossing", one)
     path = tmp_path / "surveys.jsonl"

@@ -21,7 +21,7 @@ def test_failed_draws_of_alike_tyres_keep_their_diagnostics(
 ) -> None:
     weights = SmoothedWeights(np.full(200, 1.0 / 200.0), 1.2, 12.0)
     weighted = WeightedDraws(np.zeros((200, 3)), weights)
-    drawn = ResidualDraws(weighted, 407, None)
+    drawn = ResidualDraws(weighted, 407)
     monkeypatch.setattr(sampling, "drawn_by_residuals", lambda *given: drawn)
     monkeypatch.setattr(sampling, "_compliance_draws", lambda *given: DRAWS)
     found: Any = None
@@ -30,6 +30,7 @@ def test_failed_draws_of_alike_tyres_keep_their_diagnostics(
     assert chains.ending is Termination.STEPS_EXHAUSTED
     assert (chains.ess, chains.acceptance, chains.pareto_k) == (12.0, 12.0 / 200.0, 1.2)
     assert chains.evaluations == 407
+    assert chains.points is None
 
 
 @pytest.mark.parametrize("k", [None, np.inf])
