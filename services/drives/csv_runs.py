@@ -38,7 +38,7 @@ class ReadOptions(NamedTuple):
     start: str | None = None
     accepts_guesses: bool = False
     is_draft: bool = False
-    """Whether the drive is only shown and mapped, with a missing zone left open."""
+    """Whether the drive is only shown and mapped, with a missing zone or unit left open."""
     reading: Steps = no_step_progress
     """Callback for the number of files read."""
 

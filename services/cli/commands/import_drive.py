@@ -13,12 +13,18 @@ def _import(asked: ImportOptions) -> int:
 
 def _preview(asked: ImportOptions) -> int:
     """Print a drive as it is read; write its map if requested."""
+    from services.common.errors import InputError
     from services.common.files import write_atomically
     from services.drives.importing import interpreted_drive
     from services.drives.tables.mapping import map_text
     from services.drives.tables.preview import preview_lines
 
-    found = interpreted_drive(asked)
+    try:
+        found = interpreted_drive(asked)
+    except InputError as error:
+        if asked.write_map is None:
+            raise
+        raise InputError(f"{error}; {asked.write_map} was not written") from error
     if asked.preview:
         print("\n".join(preview_lines(found, a_console().width)))
     if asked.picture is not None:
@@ -29,7 +35,7 @@ def _preview(asked: ImportOptions) -> int:
     if asked.write_map is not None:
         write_atomically(asked.write_map, map_text(found.mapping))
         has_hole = any(one.kind == "open" for one in found.guesses)
-        todo = "fill in the zone and check it" if has_hole else "check it"
+        todo = "fill in what is missing and check it" if has_hole else "check it"
         print(f"{asked.write_map}: {todo}, then driveby import --map {asked.write_map}")
     return 0
 

@@ -21,8 +21,8 @@ def scaled(
     owner: Mapping[str, TablePart],
     target: Target,
     found: Findings,
-) -> dict[str, Floats]:
-    """Return accelerations in m/s²."""
+) -> dict[str, Floats] | None:
+    """Return accelerations in m/s²; None for a draft whose unit is undetermined."""
     units: dict[str, str] = {}
     heads: dict[str, str] = {}
     for name in channels:
@@ -40,22 +40,10 @@ def scaled(
         found.guess(owner[names[0]], f"in {head} by the header: {', '.join(names)}")
     rest = {name: values for name, values in channels.items() if name not in units}
     if rest:
-        site, vehicle = target.site, target.vehicle
-        ratio = evidence.noise_ratio(rest, rate_hz, site, vehicle)
-        unit = evidence.unit_by_numbers(rest, ratio)
-        first = owner[next(iter(rest))]
+        unit = _undeclared_unit(rest, rate_hz, owner, target, found)
         if unit is None:
-            if evidence.is_counted(rest):
-                raise evidence.refuse_counts(str(first.sheet.path))
-            if evidence.is_beyond(rest, ratio) or all(
-                owner[name].placed[name].why != "exact" for name in rest
-            ):
-                raise evidence.refuse_unit(str(first.sheet.path), ratio)
-            unit = evidence.UnitEvidence("m/s2", "as their names want it")
-        for name in rest:
-            units[name] = unit.unit
-        if unit.unit != "m/s2":
-            found.guess(first, f"accelerations are in {unit.unit}; {unit.why}")
+            return None
+        units |= dict.fromkeys(rest, unit)
     for name, unit_name in units.items():
         if unit_name not in ACCELERATION:
             raise InputError(
@@ -71,6 +59,41 @@ def scaled(
                 f"most {MAX_ACCELERATION_M_PER_S2:g} is expected; give its unit in a map (--map)"
             )
     return scaled_to
+
+
+def _undeclared_unit(
+    channels: Mapping[str, Floats],
+    rate_hz: float,
+    owner: Mapping[str, TablePart],
+    target: Target,
+    found: Findings,
+) -> str | None:
+    """Return the unit of channels that neither map nor header declares.
+
+    If it is undetermined, None for a draft, with what to fill in; otherwise raise InputError.
+    """
+    ratio = evidence.noise_ratio(channels, rate_hz, target.site, target.vehicle)
+    unit = evidence.unit_by_numbers(channels, ratio)
+    first = owner[next(iter(channels))]
+    if unit is None:
+        is_counted = evidence.is_counted(channels)
+        is_open = (
+            is_counted
+            or evidence.is_beyond(channels, ratio)
+            or all(owner[name].placed[name].why != "exact" for name in channels)
+        )
+        if not is_open:
+            return "m/s2"
+        if not target.is_draft:
+            where = str(first.sheet.path)
+            raise evidence.refuse_counts(where) if is_counted else evidence.refuse_unit(where, ratio)
+        why = evidence.COUNTED if is_counted else evidence.no_unit(ratio)
+        what = "factor and unit" if is_counted else "unit"
+        found.guess(first, f"{why}: shown as in the file, give {what} of each in a map", "open")
+        return None
+    if unit.unit != "m/s2":
+        found.guess(first, f"accelerations are in {unit.unit}; {unit.why}")
+    return unit.unit
 
 
 def as_declared(

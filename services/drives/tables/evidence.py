@@ -119,16 +119,24 @@ def sentinels(values: Floats) -> NDArray[np.bool_]:
     return is_one & (size > _FAR_BEYOND * max(float(rest.max()), 1e-9))
 
 
-def refuse_unit(where: str, ratio: float | None) -> InputError:
-    """Return the error that requests the unit of accelerations."""
+def no_unit(ratio: float | None) -> str:
+    """Return the statement that the unit of accelerations is undetermined, with the evidence."""
     seen = ""
     if ratio is not None:
         seen = f" (their noise is {ratio:.3g} of the declared one"
         in_mm = 6.0 * _IN_MG[0] <= ratio <= 10.0 * _IN_MG[1]
         is_in_mg = _IN_MG[0] <= ratio <= _IN_MG[1]
         seen += ", as in mg or cm/s2)" if is_in_mg else ", as in mm/s2)" if in_mm else ")"
+    return f"the unit of the accelerations is undetermined{seen}"
+
+
+COUNTED: Final = "accelerations are whole numbers, as counts of a converter are"
+
+
+def refuse_unit(where: str, ratio: float | None) -> InputError:
+    """Return the error that requests the unit of accelerations."""
     return InputError(
-        f"{where}: the unit of the accelerations is undetermined{seen}; give it in a map (--map), "
+        f"{where}: {no_unit(ratio)}; give it in a map (--map), "
         f"unit = one of {', '.join(ACCELERATION)}"
     )
 
@@ -136,7 +144,7 @@ def refuse_unit(where: str, ratio: float | None) -> InputError:
 def refuse_counts(where: str) -> InputError:
     """Return the error that requests the factor of a converter's counts."""
     return InputError(
-        f"{where}: accelerations are whole numbers, as counts of a converter are: give factor, the "
+        f"{where}: {COUNTED}: give factor, the "
         "calibrated factor to the unit, and unit of each in [file.columns] of a map (--map)"
     )
 

@@ -18,7 +18,7 @@ class Target(NamedTuple):
     zone: str | None = None
     start: str | None = None
     is_draft: bool = False
-    """Whether a missing zone is left open in the map, and times are read as UTC."""
+    """Whether a missing zone or unit is left open in the map, and shown as UTC or m/s²."""
 
 
 class Findings:

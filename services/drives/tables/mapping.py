@@ -5,7 +5,7 @@ Every key is optional: open ones are derived from the files, and shown.
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, StrictBool, ValidationError
 
@@ -140,7 +140,7 @@ def map_text(found: ImportMap) -> str:
             lines += [_time_line(key, value) for key, value in time.items()]
         if columns:
             lines.append("[file.columns]")
-            lines += [f"{key} = {_value(value)}" for key, value in columns.items()]
+            lines += [_column_line(key, value) for key, value in columns.items()]
     return "\n".join(lines) + "\n"
 
 
@@ -148,6 +148,14 @@ def _time_line(key: str, value: Any) -> str:
     if (key, value) == ("zone", OPEN_ZONE):
         return '# zone = "Europe/Berlin"  # missing: fill in, or UTC, or +01:00'
     return f"{key} = {_value(value)}"
+
+
+def _column_line(key: str, value: dict[str, Any]) -> str:
+    line = f"{key} = {_value(value)}"
+    if key in POSITION_COLUMNS or "unit" in value:
+        return line
+    units = ", ".join(get_args(AccelerationUnit)[1:])
+    return f'{line}  # missing: add unit = "m/s2" (or {units}); of counts or volts also factor'
 
 
 def _value(value: Any) -> str:

@@ -153,7 +153,9 @@ def _read(
         )
     owner = {name: part for part in with_samples for name in part.channels()}
     accelerations = scaled(channels, rate_hz, owner, target, found)
-    declared = as_declared(accelerations, owner, target, found)
+    declared = channels
+    if accelerations is not None:
+        declared = as_declared(accelerations, owner, target, found)
     driven = track(with_fixes, positions, target, found)
     return Run(source, time_s, rate_hz, declared, driven), found.maps()
 

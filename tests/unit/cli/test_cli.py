@@ -279,7 +279,9 @@ def test_map_of_an_import_without_a_zone_leaves_the_zone_open(
     assert code == 0
     assert "open: accel_00.csv and 1 more: times have no zone: shown as UTC, give --zone" in out
     assert "form: accel_00.csv and 1 more: dates are day, month, year\n" in out
-    assert f"{named}: fill in the zone and check it, then driveby import --map {named}" in out
+    assert (
+        f"{named}: fill in what is missing and check it, then driveby import --map {named}" in out
+    )
     hole = '# zone = "Europe/Berlin"  # missing: fill in, or UTC, or +01:00'
     assert named.read_text().count(hole) == 2
     assert "times have no zone" in refused(capsys, *arguments, "--map", named, "-o", output)
@@ -288,6 +290,43 @@ def test_map_of_an_import_without_a_zone_leaves_the_zone_open(
     _, out, _ = run(capsys, *arguments, "--preview", "--zone", "UTC")
     words = "dates are day, month, year, in UTC where they name no zone"
     assert f"form: accel_00.csv and 1 more: {words}" in out
+
+
+def test_map_of_an_import_without_a_unit_leaves_the_unit_open(
+    capsys: pytest.CaptureFixture[str], drive: Path
+) -> None:
+    site, output, named = drive / "site.toml", drive.parent / "out.mcap", drive.parent / "map.toml"
+    accel = drive / "accel_00.csv"
+    rows = [row.split(",") for row in accel.read_text().splitlines()[1:]]
+    wild = [
+        ",".join([row[0], *(f"{1000.0 * float(cell):.4f}" for cell in row[1:])]) for row in rows
+    ]
+    head = "time_s,Body front,Body rear,Axle front,Axle rear"
+    accel.write_text("\n".join([head, *wild]) + "\n")
+    arguments = ("import", drive, "--site", site)
+    line = refused(capsys, *arguments, "--yes", "-o", output)
+    assert "the unit of the accelerations is undetermined" in line
+    code, out, _ = run(capsys, *arguments, "--preview", "--write-map", named)
+    assert code == 0
+    assert "open: accel_00.csv: the unit of the accelerations is undetermined" in out
+    assert f"{named}: fill in what is missing and check it, then driveby import" in out
+    hole = '  # missing: add unit = "m/s2" (or g, mg, ug, cm/s2, mm/s2, ft/s2)'
+    assert named.read_text().count(hole) == 4
+    assert "is undetermined" in refused(capsys, *arguments, "--map", named, "-o", output)
+    named.write_text(named.read_text().replace(f" }}{hole}", f', unit = "mm/s2" }}{hole}'))
+    assert run(capsys, *arguments, "--map", named, "-o", output)[0] == 0
+
+
+def test_map_that_cannot_be_written_is_named_in_the_error(
+    capsys: pytest.CaptureFixture[str], drive: Path
+) -> None:
+    named, accel = drive.parent / "map.toml", drive / "accel_00.csv"
+    accel.write_text(accel.read_text().replace("time_s,", "tick,", 1))
+    line = refused(
+        capsys, "import", drive, "--site", drive / "site.toml", "--preview", "--write-map", named
+    )
+    assert line.endswith(f"(--map); {named} was not written")
+    assert not named.exists()
 
 
 def test_the_vehicle_must_be_chosen_where_there_are_several(
