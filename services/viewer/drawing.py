@@ -19,7 +19,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import FancyBboxPatch, Rectangle
+from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from matplotlib.transforms import BboxBase
 
 from services.common.arrays import Floats
 from services.common.files import write_atomically
@@ -54,6 +56,9 @@ _BESIDE_VERDICT = 108
 """Maximum length of a line of a finding next to the word of a good verdict."""
 ABOVE_LEGEND_PT = 22.0
 """Distance of the title from the panel, with the legend between them, in points."""
+_LEGEND_PT = 9.0
+_BESIDE_TITLE_PX = 10.0
+"""Smallest distance of a legend from the title on its line."""
 
 NOMINAL_LINE: dict[str, Any] = {"color": MUTED, "linewidth": 1.0, "linestyle": (0, (4, 3))}
 BASELINE_COLOUR = VERDICT_COLOURS["good"]
@@ -83,7 +88,7 @@ STYLE: Any = {
     "ytick.labelcolor": INK,
     "xtick.labelsize": 9,
     "ytick.labelsize": 9,
-    "legend.fontsize": 9,
+    "legend.fontsize": _LEGEND_PT,
     "legend.frameon": False,
     "hatch.linewidth": 0.7,
     "svg.hashsalt": "driveby",
@@ -304,15 +309,17 @@ def simplify_numbers(axes: Axes, language: Language) -> None:
 
 
 def legend_beside_title(axes: Axes, also: Sequence[Line2D] = ()) -> None:
-    """Place the legend on the line of the title, smaller where it is wider than the panel.
+    """Place the legend on the line of the title, smaller where it is wider than its place.
+
+    Its place is the width of the panel, less the title if that is not above the legend.
 
     The entries `also` follow those of the panel.
     """
     handles = [*axes.get_legend_handles_labels()[0], *also]
     if not handles:
         return
-    is_long, room = len(handles) > 4, 1.0
-    for _ in range(2):
+    is_long, size_pt = len(handles) > 4, _LEGEND_PT
+    for _ in range(3):
         legend = axes.legend(
             handles=handles,
             loc="lower right",
@@ -321,12 +328,26 @@ def legend_beside_title(axes: Axes, also: Sequence[Line2D] = ()) -> None:
             columnspacing=0.8 if is_long else 1.6,
             handlelength=1.5 if is_long else 2.4,
             handletextpad=0.4 if is_long else 0.8,
-            fontsize=room * 9.0,
+            fontsize=size_pt,
             borderpad=0.0,
         )
-        room = axes.get_window_extent().width / legend.get_window_extent().width
+        drawn, panel = legend.get_window_extent(), axes.get_window_extent()
+        room = (panel.x1 - _left_of_legend(axes, drawn)) / drawn.width
         if room >= 1.0:
             return
+        size_pt *= room
+
+
+def _left_of_legend(axes: Axes, legend: BboxBase) -> float:
+    """Return where the place of a legend begins, in pixels: the panel's edge or the title's end."""
+    panel, written = axes.get_window_extent(), axes.get_title(loc="left")
+    if not written:
+        return panel.x0
+    (title,) = (text for text in axes.findobj(Text) if text.get_text() == written)
+    box = title.get_window_extent()
+    if box.y0 >= legend.y1:
+        return panel.x0
+    return max(panel.x0, box.x1 + _BESIDE_TITLE_PX)
 
 
 def write_centred(axes: Axes, text: str) -> None:

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 from matplotlib.markers import CARETUP
+from matplotlib.text import Text
 
 from schemas.results import Results
 from schemas.site import Site
@@ -99,6 +100,20 @@ def test_legend_with_arrows_is_no_wider_than_its_panel(site: Site) -> None:
         assert drawn is not None
         room = axes.get_window_extent().width
         assert drawn.get_window_extent().width <= 1.02 * room, name
+
+
+def test_legend_with_the_truth_lies_on_no_title(site: Site) -> None:
+    view = view_of_crossing(with_open_end(site).crossings[0], site.bridges[0])
+    chainage_m = np.linspace(-5.0, 40.0, 100)
+    truth = (chainage_m, 1e-3 * np.sin(chainage_m))
+    figure = draw_crossing(view, element_truth=[1.0] * 7, road_truth=truth)
+    assert_words_apart(figure)
+    for axes in figure.axes[:3]:
+        drawn = axes.get_legend()
+        assert drawn is not None
+        (title,) = (t for t in axes.findobj(Text) if t.get_text() == axes.get_title("left"))
+        assert drawn.get_window_extent().x0 > title.get_window_extent().x1, title.get_text()
+        assert drawn.get_texts()[0].get_fontsize() > 8.0
 
 
 def test_bridge_of_resolved_elements_has_no_arrow(site: Site) -> None:
