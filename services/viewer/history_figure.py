@@ -36,6 +36,12 @@ from services.viewer.drawing import (
 )
 
 _PANEL_IN, _TEMPERATURE_IN = 0.92, 0.75
+_PANELS_LEFT = 0.115
+"""Left edge of the panels: the reference of each stands next to it, as large as ticks."""
+_SMALL_PT = 9.0
+"""Smallest size of letters: 7 pt in a report's column of 180 mm."""
+_NAME_AT = 0.86
+"""Height of an element's name next to its panel, above its reference."""
 _MAX_CHARACTERS = 100
 """Maximum length of an acknowledgement's note, one line."""
 _LINE_CHARACTERS = 105
@@ -188,11 +194,11 @@ def draw_history(
     for number, (text, colour) in enumerate(lines):
         top = 1.0 - (0.58 + 0.2 * number) / height
         figure.text(LEFT, top, text, va="top", fontsize=9.5, color=colour, parse_math=False)
-    limits = _limits(history, elements)
+    limits, width = _limits(history, elements), RIGHT - _PANELS_LEFT
     first = None
     for n in range(elements):
         at = 1.0 - (heading + _PANEL_IN * (n + 1)) / height
-        axes = figure.add_axes((LEFT, at, RIGHT - LEFT, (_PANEL_IN - 0.12) / height), sharex=first)
+        axes = figure.add_axes((_PANELS_LEFT, at, width, (_PANEL_IN - 0.12) / height), sharex=first)
         first = first or axes
         _draw_element(axes, history, n, limits, language)
         axes.tick_params(labelbottom=n == elements - 1 and not has_temperature)
@@ -202,7 +208,7 @@ def draw_history(
         margin = max(least, 0.04 * (max(days) - min(days)))
         first.set_xlim(min(days) - margin, max(days) + margin)
     if has_temperature and first is not None:
-        size = (LEFT, bottom / height, RIGHT - LEFT, (_TEMPERATURE_IN - 0.1) / height)
+        size = (_PANELS_LEFT, bottom / height, width, (_TEMPERATURE_IN - 0.1) / height)
         _draw_temperature(figure.add_axes(size, sharex=first), history, language)
     return figure
 
@@ -296,21 +302,9 @@ def _draw_element(
         axes.plot(times, mean, linestyle="none", marker="o", markersize=3.2, color=colour)
     for mark in history.marks:
         if mark.element == n + 1:
-            colour = _colour(mark)
-            since, raised = _dates([mark.since_s, mark.raised_s])
-            axes.axvspan(since, raised, color=colour, alpha=0.13, linewidth=0.0)
-            axes.axvline(raised, color=colour, linewidth=1.6)
-            which = "stiffer" if mark.is_stiffer else "weaker"
-            wording = language.text(f"history.mark.{which}")
-            if mark.acknowledged:
-                wording = language.text("history.mark_noted", mark=wording)
-            axes.annotate(
-                wording, (raised, limits[1]),
-                xytext=(4, -3), textcoords="offset points", va="top", fontsize=8.5,
-                color=colour, fontweight="bold",
-            )  # fmt: skip
+            _draw_mark(axes, history, mark, limits[1], language)
     axes.set_ylim(*limits)
-    axes.set_ylabel(f"EI_{n + 1}", rotation=0, ha="right", va="center", labelpad=6)
+    axes.set_ylabel(f"EI_{n + 1}", rotation=0, ha="right", va="center", labelpad=6, y=_NAME_AT)
     axes.yaxis.set_major_locator(MaxNLocator(nbins=5, steps=[1, 2, 5, 10], integer=True))
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:.0f} %")
     axes.yaxis.tick_right()
@@ -319,11 +313,31 @@ def _draw_element(
     # Outside the panel, as points may be anywhere within it.
     axes.annotate(
         f"100 %:\n{reference.label(language)}\n"
-        f"{language.number(reference.ei_nm2 / 1e9, '#.3g')} GN·m²", (0.0, 0.5),
-        xycoords="axes fraction", xytext=(-6, -8),
-        textcoords="offset points", ha="right", va="top", fontsize=7, color=MUTED,
+        f"{language.number(reference.ei_nm2 / 1e9, '#.3g').rstrip('.,')} GN·m²", (0.0, _NAME_AT),
+        xycoords="axes fraction", xytext=(-6, -7),
+        textcoords="offset points", ha="right", va="top", fontsize=_SMALL_PT, color=MUTED,
     )  # fmt: skip
     _over_time(axes, language)
+
+
+def _draw_mark(
+    axes: Axes, history: HistoryView, mark: AlarmMark, top: float, language: Language
+) -> None:
+    """Draw an alarm with its words, on the side of its line where there is more room."""
+    colour = _colour(mark)
+    since, raised = _dates([mark.since_s, mark.raised_s])
+    axes.axvspan(since, raised, color=colour, alpha=0.13, linewidth=0.0)
+    axes.axvline(raised, color=colour, linewidth=1.6)
+    wording = language.text(f"history.mark.{'stiffer' if mark.is_stiffer else 'weaker'}")
+    if mark.acknowledged:
+        wording = language.text("history.mark_noted", mark=wording)
+    middle_s = 0.5 * (history.points[0].time_s + history.points[-1].time_s)
+    is_late = mark.raised_s > middle_s
+    axes.annotate(
+        wording, (raised, top), xytext=(-4 if is_late else 4, -3), textcoords="offset points",
+        ha="right" if is_late else "left", va="top", fontsize=_SMALL_PT, color=colour,
+        fontweight="bold",
+    )  # fmt: skip
 
 
 def _draw_temperature(axes: Axes, history: HistoryView, language: Language) -> None:

@@ -2,11 +2,14 @@
 
 import matplotlib
 import numpy as np
+import pytest
 
+from services.common.language import language_of
 from services.history.bridge_history import Statement, StoredBaseline
 from services.viewer.crossing_view import VERDICT_COLOURS
 from services.viewer.drawing import STYLE
 from services.viewer.history_figure import AlarmMark, HistoryView, PeriodPoint, draw_history
+from tests.unit.words import assert_words_apart, words
 
 WEEK_S = 7 * 86_400.0
 BEGIN_S = 1.7364e9
@@ -161,3 +164,28 @@ def test_one_week_is_shown_over_weeks_not_years() -> None:
     (first, _) = drawn(HistoryView("b-1", "week", weeks(1.0), (), ())).axes
     begin, end = first.get_xlim()
     assert end - begin < 20.0
+
+
+@pytest.mark.parametrize("code", ["en", "de"])
+def test_letters_are_seven_points_in_a_column_and_apart(code: str) -> None:
+    """A report's column is 180 mm wide."""
+    points = tuple(
+        one._replace(temperature_deg_c=10.0 + n)
+        for n, one in enumerate(weeks(1.0, 0.98, 1.02, 0.97, 0.95, 0.99, 0.9))
+    )
+    marks = tuple(
+        mark("the owner, 2025-06-23")._replace(
+            element=element,
+            since_s=BEGIN_S + since * WEEK_S,
+            raised_s=BEGIN_S + (since + 0.5) * WEEK_S,
+        )
+        for element, since in ((1, 0.5), (2, 5.0))
+    )
+    for baseline in (None, StoredBaseline("then.json", (160e9, 200e9))):
+        view = HistoryView("b-1", "week", points, marks, (), baseline)
+        with matplotlib.rc_context(STYLE):
+            figure = draw_history(view, with_heading=False, language=language_of(code))
+        assert_words_apart(figure)
+        scale = 180.0 / (25.4 * figure.get_figwidth())
+        assert min(text.get_fontsize() for text in words(figure)) * scale >= 7.0
+    assert any("\n160 GN·m²" in text.get_text() for text in words(figure))
