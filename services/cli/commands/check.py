@@ -41,6 +41,7 @@ def _check(options: CheckOptions) -> int:
     from services.common.errors import InputError
     from services.common.files import check_writable, write_atomically
     from services.common.progress import reading_bar
+    from services.inspection.finding import without_repetition
     from services.inspection.inspect import inspect
 
     paths = options.paths if options.site is None else (options.site, *options.paths)
@@ -78,7 +79,11 @@ def _check(options: CheckOptions) -> int:
     for report in found:
         print("\n".join(lines_of(report, is_brief=report.is_run and runs > 1)))
     wrong, left_open = (
-        sum(finding.state.value == state for report in found for finding in report.findings)
+        sum(
+            finding.state.value == state
+            for report in found
+            for finding in without_repetition(report.findings)
+        )
         for state in ("wrong", "open")
     )
     print(
@@ -121,13 +126,13 @@ def _print_json(reports: "list[CheckReport]") -> None:
 
 
 def lines_of(report: "CheckReport", *, is_brief: bool) -> Iterator[str]:
-    """Yield a line for each finding; for many runs only the number of those in order."""
+    """Yield a line for each finding on all its channels; of many runs only those not in order."""
+    from services.inspection.finding import without_repetition
+
     yield report.source
-    fine = 0
-    for finding in report.findings:
-        if is_brief and finding.state.value == "ok":
-            fine += 1
-            continue
+    shown = [one for one in report.findings if not is_brief or one.state.value != "ok"]
+    fine = len(report.findings) - len(shown)
+    for finding in without_repetition(shown):
         advice = f"; {finding.advice}" if finding.advice else ""
         yield f"  {finding.state.value:5}  {finding.text}{advice}"
     if fine:

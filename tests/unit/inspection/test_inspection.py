@@ -15,11 +15,12 @@ from schemas.signals import CHANNELS, decode_accel, decode_gnss, encode_accel, e
 from schemas.site import Site
 from schemas.site_file import site_toml
 from schemas.topics import Message
+from services.cli.commands.check import lines_of
 from services.common.errors import InputError
 from services.drives.importing import normalised_runs
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.inspection.finding import CheckFinding, CheckStatus
-from services.inspection.inspect import findings_of_run
+from services.inspection.inspect import CheckReport, findings_of_run
 from services.inspection.noise import noise_of
 from services.inspection.recorded import recorded_runs
 from services.inspection.site import findings_of_site
@@ -403,3 +404,25 @@ def test_every_name_is_snake_case_and_says_one_thing() -> None:
     names = [f.name for f in findings_of_site(sound().site, sound().site.vehicles[0])]
     assert all(name == name.lower() and " " not in name for name in names)
     assert all(before != after for before, after in pairwise(names))
+
+
+def test_sentence_on_several_channels_is_printed_once() -> None:
+    advice = "record a minute at standstill"
+    findings = [
+        CheckFinding("rate", CheckStatus.OK, "a: 100 samples a second"),
+        CheckFinding("rate", CheckStatus.OK, "b: 100 samples a second"),
+        CheckFinding("rate", CheckStatus.OK, "c: 50 samples a second"),
+        CheckFinding("noise", CheckStatus.OPEN, "a: noise unknown", advice),
+        CheckFinding("noise", CheckStatus.OPEN, "b: noise unknown", advice),
+        CheckFinding("noise", CheckStatus.OPEN, "c: noise at most 12", advice),
+        CheckFinding("gaps", CheckStatus.OK, "no gap"),
+    ]
+    report = CheckReport("drive.mcap", tuple(findings), is_run=True)
+    assert list(lines_of(report, is_brief=False)) == [
+        "drive.mcap",
+        "  ok     a, b: 100 samples a second",
+        "  ok     c: 50 samples a second",
+        f"  open   a, b: noise unknown; c: noise at most 12; {advice}",
+        "  ok     no gap",
+    ]
+    assert list(lines_of(report, is_brief=True))[2] == "  ok     4 other findings (--json has all)"
