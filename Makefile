@@ -90,8 +90,9 @@ lint: $(PACKAGES) ## format, lint, types and import contracts
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-tables: $(STAMP) ## write the tables of the pages that follow from code
+tables: $(STAMP) ## write the tables of the pages and the JSON schemas that follow from code
 	$(BIN)/python docs/scripts/tables.py
+	$(BIN)/python -m schemas.json.generate
 
 docs: $(STAMP) ## the pages as a site, in build/site
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements/docs.txt

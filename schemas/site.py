@@ -31,8 +31,14 @@ def _per_channel(value: object) -> object:
     return [value] * 4 if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
-Rates = Annotated[tuple[Rate, Rate, Rate, Rate], BeforeValidator(_per_channel)]
-Densities = Annotated[tuple[Density, Density, Density, Density], BeforeValidator(_per_channel)]
+_FourRates = tuple[Rate, Rate, Rate, Rate]
+_FourDensities = tuple[Density, Density, Density, Density]
+Rates = Annotated[
+    _FourRates, BeforeValidator(_per_channel, json_schema_input_type=_FourRates | Rate)
+]
+Densities = Annotated[
+    _FourDensities, BeforeValidator(_per_channel, json_schema_input_type=_FourDensities | Density)
+]
 
 
 class Sensor(Table):

@@ -86,10 +86,10 @@ class Bridge(Lane, Damping, WithSpreads):
     """Scale of the half-normal prior of the vertical compliance of the end bearings."""
     interior_supports_m: tuple[Positive, ...] = ()
     """Chainages of the supports between the ends, ascending."""
-    bearings: Annotated[tuple[Bearing, Bearing], BeforeValidator(_per_end)] = (
-        "unknown",
-        "unknown",
-    )
+    bearings: Annotated[
+        tuple[Bearing, Bearing],
+        BeforeValidator(_per_end, json_schema_input_type=tuple[Bearing, Bearing] | Bearing),
+    ] = ("unknown", "unknown")
     """Rotational restraint at start and end: none, a spring, or unknown (estimated)."""
     start_altitude_m: Altitude | None = None
     end_altitude_m: Altitude | None = None

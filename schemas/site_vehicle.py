@@ -1,7 +1,7 @@
 """`[vehicle]` of a site file: a truck with its axles, and its accelerometers if it names them."""
 
 import math
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -14,6 +14,7 @@ from schemas.site_numbers import (
     Identifier,
     NotNegativePair,
     Number,
+    Positive,
     PositivePair,
     Spread,
     Table,
@@ -95,12 +96,21 @@ class Vehicle(WithSpreads):
     """Ratio κ: the pitch inertia is κ·m_s·d_1·d_2."""
     tyre_damping_ns_per_m: NotNegativePair = (0.0, 0.0)
     """Tyre damping; zero: unknown (see `scale_at_zero`)."""
-    tyre_width_m: Annotated[PositivePair | None, BeforeValidator(_two)] = None
+    tyre_width_m: Annotated[
+        PositivePair | None,
+        BeforeValidator(_two, json_schema_input_type=PositivePair | Positive | None),
+    ] = None
     """Tread widths; with the next four they determine the profile mismatch of the axles."""
     tyre_contact_length_m: PositivePair | None = None
-    twin_tyre_distance_m: Annotated[NotNegativePair | None, BeforeValidator(_none_twin)] = None
+    twin_tyre_distance_m: Annotated[
+        NotNegativePair | None,
+        BeforeValidator(_none_twin, json_schema_input_type=NotNegativePair | Literal[0] | None),
+    ] = None
     """Distance between the centres of twin tyres; 0 for single tyres."""
-    track_m: Annotated[tuple[Track, Track] | None, BeforeValidator(_two)] = None
+    track_m: Annotated[
+        tuple[Track, Track] | None,
+        BeforeValidator(_two, json_schema_input_type=tuple[Track, Track] | Track | None),
+    ] = None
     """Distance between the centres of the left and right wheels of each axle."""
     rear_axle_offset_m: Annotated[Number, Field(ge=-1, le=1)] | None = None
     """Distance of the rear axle's path to the left of the front axle's."""

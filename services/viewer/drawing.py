@@ -340,14 +340,12 @@ def legend_beside_title(axes: Axes, also: Sequence[Line2D] = ()) -> None:
 
 def _left_of_legend(axes: Axes, legend: BboxBase) -> float:
     """Return where the place of a legend begins, in pixels: the panel's edge or the title's end."""
-    panel, written = axes.get_window_extent(), axes.get_title(loc="left")
-    if not written:
-        return panel.x0
-    (title,) = (text for text in axes.findobj(Text) if text.get_text() == written)
-    box = title.get_window_extent()
-    if box.y0 >= legend.y1:
-        return panel.x0
-    return max(panel.x0, box.x1 + _BESIDE_TITLE_PX)
+    edge, written = float(axes.get_window_extent().x0), axes.get_title(loc="left")
+    titles = (text for text in axes.findobj(Text) if written and text.get_text() == written)
+    for box in (title.get_window_extent() for title in titles):
+        if box.y0 < legend.y1:
+            edge = max(edge, float(box.x1) + _BESIDE_TITLE_PX)
+    return edge
 
 
 def write_centred(axes: Axes, text: str) -> None:

@@ -73,7 +73,8 @@ def test_the_wheel_holds_one_package(wheel: Path) -> None:
         assert top == {"driveby", about}
         assert file.read(f"{about}/top_level.txt") == b"driveby\n"
     assert not [name for name in names if "studies" in name]
-    for name in ("py.typed", "services/data/paper.toml", "schemas/proto/driveby.proto"):
+    data = ("services/data/paper.toml", "schemas/proto/driveby.proto")
+    for name in ("py.typed", *data, "schemas/json/site.schema.json"):
         assert f"driveby/{name}" in names
 
 

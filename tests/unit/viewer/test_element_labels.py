@@ -113,7 +113,7 @@ def test_legend_with_the_truth_lies_on_no_title(site: Site) -> None:
         assert drawn is not None
         (title,) = (t for t in axes.findobj(Text) if t.get_text() == axes.get_title("left"))
         assert drawn.get_window_extent().x0 > title.get_window_extent().x1, title.get_text()
-        assert drawn.get_texts()[0].get_fontsize() > 8.0
+        assert float(drawn.get_texts()[0].get_fontsize()) > 8.0
 
 
 def test_bridge_of_resolved_elements_has_no_arrow(site: Site) -> None:

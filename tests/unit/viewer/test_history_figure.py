@@ -187,5 +187,5 @@ def test_letters_are_seven_points_in_a_column_and_apart(code: str) -> None:
             figure = draw_history(view, with_heading=False, language=language_of(code))
         assert_words_apart(figure)
         scale = 180.0 / (25.4 * figure.get_figwidth())
-        assert min(text.get_fontsize() for text in words(figure)) * scale >= 7.0
+        assert min(float(text.get_fontsize()) for text in words(figure)) * scale >= 7.0
     assert any("\n160 GN·m²" in text.get_text() for text in words(figure))

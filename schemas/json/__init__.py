@@ -1,0 +1,1 @@
+"""JSON schemas of the site file and of results, for editors and for other programs' validators."""
