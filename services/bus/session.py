@@ -50,7 +50,9 @@ _ENDPOINT = re.compile(r"(tcp|tls|quic|ws|unixsock-stream)/\S+")
 _TRY_ONCE_MS = 0
 """Setting of a client whose attempt is not repeated by Zenoh: a refused one ends at once, so that
 Python can handle a signal before the next one. One that is neither refused nor answered ends after
-Zenoh's limit for a handshake, 10 s: it takes four round trips, more where packets are lost."""
+`_HANDSHAKE_S`."""
+_HANDSHAKE_S = 10.0
+"""Limit of a handshake, Zenoh's own: it takes four round trips, more where packets are lost."""
 _PAUSE_S = 0.1
 """Pause between attempts that are refused at once."""
 _CONNECT_S = 1.0
@@ -81,11 +83,12 @@ def open_session(
     timeout_s: float | None = None,
     tls: Path | None = None,
     insecure: bool = False,
+    handshake_s: float = _HANDSHAKE_S,
 ) -> zenoh.Session:
     """Open a session: a client of the router at `connect`, or a router that listens at `listen`.
 
-    A client waits `timeout_s` (None: for ever) for the router, and up to 10 s longer for the end of
-    an attempt if the network neither connects nor refuses. It reconnects by itself after the
+    A client waits `timeout_s` (None: for ever) for the router, and up to `handshake_s` longer for
+    the end of an attempt that is neither answered nor refused. It reconnects by itself after the
     connection is lost. It must be closed, or the process does not end; it is a context manager.
 
     `tls` is a folder of `driveby certs`: both sides authenticate, only TLS is used, and the
@@ -110,6 +113,7 @@ def open_session(
         os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)  # read at a process's first session
     deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
     config = _configuration(endpoint, tls, is_client=connect is not None)
+    config.insert_json5("transport/unicast/open_timeout", str(round(1e3 * handshake_s)))
     while True:
         try:
             session = zenoh.open(config)

@@ -29,6 +29,7 @@ _VERDICTS: Final = {
 _SILENT: Final = (
     "the one there does not answer the TLS handshake; was it started without --tls FOLDER?"
 )
+_FROZEN: Final = "the one there accepts connections and answers none; is it stopped or overloaded?"
 _REFUSALS: Final = {
     "UNKNOWN_CA": "of another authority than its own",
     "CERTIFICATE_EXPIRED": "expired",
@@ -62,9 +63,13 @@ def cause_of_failure(endpoint: str, tls: Path | None) -> str | None:
 def _without_credentials(link: socket.socket) -> str | None:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    with contextlib.suppress(OSError), context.wrap_socket(link):
-        return "the one there requires --tls FOLDER (and tls/ in the endpoint)"
-    return None
+    try:
+        with context.wrap_socket(link):
+            return "the one there requires --tls FOLDER (and tls/ in the endpoint)"
+    except TimeoutError:
+        return _FROZEN
+    except OSError:
+        return None
 
 
 def _handshake(link: socket.socket, host: str, tls: Path) -> str | None:

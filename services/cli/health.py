@@ -46,7 +46,9 @@ def health_command(
     except ValueError as error:
         raise InputError(str(error)) from None
     with (
-        open_session(connect=endpoint, timeout_s=patience_s, tls=tls) as session,
+        open_session(
+            connect=endpoint, timeout_s=patience_s, tls=tls, handshake_s=patience_s
+        ) as session,
         Subscription(session, where) as subscription,
     ):
         latest = _latest(subscription, patience_s)

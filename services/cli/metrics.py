@@ -80,7 +80,9 @@ def metrics_command(
     """
     where, board = _selected(service, realm), HealthBoard()
     with (
-        open_session(connect=endpoint, timeout_s=patience_s, tls=tls) as session,
+        open_session(
+            connect=endpoint, timeout_s=patience_s, tls=tls, handshake_s=patience_s
+        ) as session,
         Subscription(session, where) as subscription,
     ):
         deadline_s = time.monotonic() + patience_s

@@ -1,5 +1,6 @@
 """`driveby health` of a service that does not answer."""
 
+import socket
 import time
 from pathlib import Path
 
@@ -28,6 +29,18 @@ def test_unreachable_address_names_the_option_for_another(endpoint: str) -> None
         f"no router answers at {endpoint} within 0.5 s; start `driveby logger` first or give its "
         "address with --endpoint"
     )
+
+
+def test_frozen_router_is_named_within_the_patience() -> None:
+    """Zenoh alone would wait for 10 s, once or more often."""
+    with socket.create_server(("127.0.0.1", 0)) as frozen:
+        endpoint = f"tcp/127.0.0.1:{frozen.getsockname()[1]}"
+        began_s = time.monotonic()
+        with pytest.raises(FailureError, match="accepts connections and answers none"):
+            health_command(
+                service="logger", endpoint=endpoint, tls=None, realm="live", patience_s=0.5
+            )
+        assert time.monotonic() - began_s < 9.0
 
 
 def test_silence_with_credentials_names_the_list(credentials: Path, tls_endpoint: str) -> None:
