@@ -31,10 +31,11 @@ def sessions_publishing(session: zenoh.Session, where: str, timeout_s: float) ->
 class Presence:
     """Whether a session is connected, and the services whose publishers have left."""
 
-    def __init__(self, session: zenoh.Session, realm: str) -> None:
+    def __init__(self, session: zenoh.Session, realm: str, stream: str = "health") -> None:
+        """Watch the publishers of a stream: `health` of all services, `durable` of loggers."""
         self._session = session
         self._tokens = session.liveliness().declare_subscriber(
-            f"{selector(realm, 'service', 'health')}/@adv/pub/**",
+            f"{selector(realm, 'service', stream)}/@adv/pub/**",
             handlers.RingChannel(_TOKENS_WAITING),
             history=True,
         )
@@ -63,6 +64,11 @@ class Presence:
             self.gone_s = dict.fromkeys(self.gone_s, now_s)
         while (token := self._tokens.try_recv()) is not None:
             self._note(str(token.key_expr), now_s, is_there=token.kind == zenoh.SampleKind.PUT)
+
+    @property
+    def is_any_there(self) -> bool:
+        """Whether any service publishes the stream, as of the last call of `look`."""
+        return bool(self._present)
 
     def close(self) -> None:
         """Stop looking."""

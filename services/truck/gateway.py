@@ -59,6 +59,7 @@ from services.bus.publisher import Publisher
 from services.common.errors import FailureError
 from services.common.log_lines import about
 from services.common.naming import count_of
+from services.truck.logger_watch import LoggerWatch
 from services.truck.spool import Spool
 
 __all__ = ["Gateway"]
@@ -118,6 +119,7 @@ class Gateway:
         self._complained_s = float("-inf")
         self._unsubscribed_s = float("-inf")
         self._subscribers: SubscriberCheck | None = None
+        self._logger_watch: LoggerWatch | None = None
         self._alive: Any = None
         self._own_session: zenoh.Session | None = None
         self._spool = None if spool is None else _SpoolService(self, spool)
@@ -225,6 +227,15 @@ class Gateway:
             self._unsubscribed_s = now_s
             self.log.warning("%s", why)
 
+    def log_absence(self) -> None:
+        """Log once that the router or logger has left, and once that it is back."""
+        if self._logger_watch is None:
+            return
+        news = self._logger_watch.news(time.monotonic())
+        if news is not None:
+            level = logging.WARNING if self._logger_watch.is_absent else logging.INFO
+            self.log.log(level, "%s: %s", self.vehicle, news)
+
     def close(self) -> None:
         """Leave the bus. The next boot offers spooled messages that no logger has on disk."""
         self._closing.set()
@@ -234,8 +245,9 @@ class Gateway:
             self._alive.undeclare()
         if self._spool is not None:
             self._spool.close()
-        if self._subscribers is not None:
-            self._subscribers.close()
+        for check in (self._subscribers, self._logger_watch):
+            if check is not None:
+                check.close()
         self.delivery.close()
         self.publisher.close()
         if self._own_session is not None:
@@ -274,6 +286,7 @@ class Gateway:
         self._alive = session.liveliness().declare_token(alive)
         where = Key(self.publisher.realm, "vehicle", self.vehicle, "accel")
         self._subscribers = SubscriberCheck(session, where)
+        self._logger_watch = LoggerWatch(session, self.publisher.realm)
         self.is_online = True
         if self._spool is not None:
             self._spool.join(session)
@@ -373,6 +386,7 @@ class _SpoolService:
         rounds = 0
         while not self._closing.wait(_SYNC_PERIOD_S):
             rounds += 1
+            self._gateway.log_absence()
             try:
                 self.spool.sync()
             except (OSError, FailureError) as error:
