@@ -98,18 +98,24 @@ def declare_and_wait(publisher: Publisher, keys: Iterable[Key], timeout_s: float
 
 
 def confirm(
-    delivery: DeliveryTracker, sent: int, complaint: Callable[[], str | None] = lambda: None
+    delivery: DeliveryTracker,
+    sent: int,
+    complaint: Callable[[], str | None] = lambda: None,
+    *,
+    is_spooled: bool = False,
 ) -> None:
     """Wait until a logger has everything on disk; raise FailureError if it fails.
 
     Without a logger this only gives the subscribers time to fetch missing messages; `complaint`
-    returns why there are none, which is a failure too, or None.
+    returns why there are none, which is a failure too, or None. `is_spooled`: a spool keeps the
+    messages.
     """
     missing = delivery.wait(DELIVERY_TIMEOUT_S)
     if missing and delivery.has_logger:
+        kept = "; the spool keeps the others and offers them at the next start"
         raise FailureError(
             f"only {sent - missing} of {sent} messages were confirmed by the logger within "
-            f"{DELIVERY_TIMEOUT_S:.0f} s"
+            f"{DELIVERY_TIMEOUT_S:.0f} s{kept if is_spooled else ''}"
         )
     if missing and (why := complaint()) is not None:
         raise FailureError(f"none of {sent} messages was received: {why}")

@@ -20,6 +20,8 @@ def health_line(figures: Mapping[str, float]) -> str:
     why = ""
     if known["lag_s"] > _LONG_LAG_S:
         why = " (old samples: replayed faster than real time, sent late, or a clock is wrong)"
+    room = "disk_free_bytes"  # unknown until the writer has looked
+    left = f", {known[room] / 1e9:.1f} GB left" if room in figures else ""
     return (
         f"{count_of(known['trucks_alive'], 'truck')}, {known['rate_per_s']:.0f} messages/s, "
         f"lag {offset_in_words(known['lag_s'], 2)}{why}, "
@@ -27,7 +29,7 @@ def health_line(figures: Mapping[str, float]) -> str:
         f"missing {known['missing']:.0f}, recovered {known['recovered']:.0f}, "
         f"duplicates {known['duplicates']:.0f}, refused {known['refused']:.0f}, "
         f"dropped {known['dropped']:.0f}, written {known['written']:.0f}, "
-        f"{count_of(known['files'], 'open file')}, {known['disk_free_bytes'] / 1e9:.1f} GB left"
+        f"{count_of(known['files'], 'open file')}{left}"
     )
 
 

@@ -103,7 +103,12 @@ def run(asked: GatewaySettings, ready: Callable[[], None] = lambda: None) -> int
         for item in truck.finish():
             out.put(item)
         reports.report(closing=True)
-        confirm(gateway.delivery, out.sent, gateway.subscriber_complaint)
+        confirm(
+            gateway.delivery,
+            out.sent,
+            gateway.subscriber_complaint,
+            is_spooled=spooled is not None,
+        )
         sent = count_of(out.sent, "message")
         gateway.log.info("%s of %s published in realm %s", sent, vehicle, realm)
     return 0

@@ -101,7 +101,8 @@ def run(asked: TruckSettings, *, connect_timeout_s: float | None = CONNECT_TIMEO
             # A real truck continues as well; its cache serves late subscribers.
             gateway.warn_without_subscriber()
         sent = _publish(gateway, messages, asked, stop)
-        confirm(gateway.delivery, sent, gateway.subscriber_complaint)
+        is_spooled = spool is not None
+        confirm(gateway.delivery, sent, gateway.subscriber_complaint, is_spooled=is_spooled)
         _report_end(gateway, sent, asked.address)
     return 0
 

@@ -4,11 +4,15 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
 from schemas.topics import Key, Message
 from services.bus import playback
+from services.bus.delivery import DeliveryTracker
+from services.common.errors import FailureError
 from tests.waiting import LONGEST_S
 
 WHERE = Key("live", "vehicle", "truck-1", "gnss")
@@ -78,3 +82,11 @@ def test_a_signal_that_comes_while_one_waits_for_it_stops_nothing_else() -> None
         stop.set()
         assert stop.wait(LONGEST_S)
         assert stop.wait()
+
+
+@pytest.mark.parametrize("is_spooled", [True, False])
+def test_unconfirmed_messages_are_in_the_spool_if_there_is_one(is_spooled: bool) -> None:
+    tracker = SimpleNamespace(has_logger=True, wait=lambda timeout_s: 302)
+    with pytest.raises(FailureError, match="only 58 of 360 messages were confirmed") as caught:
+        playback.confirm(cast("DeliveryTracker", tracker), 360, is_spooled=is_spooled)
+    assert str(caught.value).endswith("offers them at the next start") is is_spooled

@@ -125,6 +125,8 @@ def test_a_drive_as_it_was_says_nothing(caplog: pytest.LogCaptureFixture) -> Non
 
 def test_long_lag_is_explained_where_it_is_reported() -> None:
     assert "lag 0.20 s, queue 0" in health_line({"lag_s": 0.2})
+    assert health_line({"lag_s": 0.2}).endswith("0 open files")  # the room is not known yet
+    assert health_line({"disk_free_bytes": 8.28e10}).endswith("0 open files, 82.8 GB left")
     assert (
         "lag 1356.00 s (old samples: replayed faster than real time, sent late, or a clock is "
         "wrong), queue 0" in health_line({"lag_s": 1356.0})
