@@ -86,7 +86,9 @@ def _undeclared_unit(
             return "m/s2"
         if not target.is_draft:
             where = str(first.sheet.path)
-            raise evidence.refuse_counts(where) if is_counted else evidence.refuse_unit(where, ratio)
+            raise (
+                evidence.refuse_counts(where) if is_counted else evidence.refuse_unit(where, ratio)
+            )
         why = evidence.COUNTED if is_counted else evidence.no_unit(ratio)
         what = "factor and unit" if is_counted else "unit"
         found.guess(first, f"{why}: shown as in the file, give {what} of each in a map", "open")
