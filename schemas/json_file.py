@@ -26,6 +26,8 @@ def load_json(model: type[ModelT], path: Path, what: str) -> ModelT:
         problem = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in problem["loc"])
         message = problem["msg"].removeprefix("Value error, ")
+        if problem["type"] == "extra_forbidden":
+            message = "is unknown here, read the file with the version of driveby that wrote it"
         message += _remark_of_newer(content)
         raise InputError(f"{path}: {place or f'not {what}'}: {message}") from error
 
