@@ -11,6 +11,7 @@ from services.bus.publisher import Publisher
 from services.bus.session import open_session
 from services.cli.health import health_command
 from services.common.errors import FailureError
+from tests.waiting import until
 
 
 def test_silent_service_is_named_with_its_realm(endpoint: str) -> None:
@@ -118,14 +119,21 @@ def test_services_of_one_name_are_counted(endpoint: str) -> None:
         open_session(connect=endpoint) as second,
     ):
         publishers = [Publisher(session, "live") for session in (first, second)]
-        lines = []
-        for publisher in publishers:
+
+        def line() -> str:
+            return health_command(service="worker", endpoint=endpoint, tls=None, realm="live")
+
+        def declare(publisher: Publisher) -> None:
             sent = pb.Health(schema_version=1, service="worker", ok=True, time_ns=time.time_ns())
             publisher.put("service", "worker", "health", sent.SerializeToString())
-            lines.append(
-                health_command(service="worker", endpoint=endpoint, tls=None, realm="live")
-            )
+
+        declare(publishers[0])
+        alone = line()
+        declare(publishers[1])
+        # The router learns of a publisher when its declaration arrives.
+        until(lambda: ";" in line())
+        both = line()
         for publisher in publishers:
             publisher.close()
-    assert lines[0] == "worker in realm live is well (health sent 0 s ago)"
-    assert lines[1] == f"{lines[0]}; one of 2 services of this name; give each one another --id"
+    assert alone == "worker in realm live is well (health sent 0 s ago)"
+    assert both.partition(";")[2] == " one of 2 services of this name; give each one another --id"
