@@ -20,7 +20,7 @@ def test_right_clocks_need_no_note() -> None:
 
 
 def test_one_truck_and_one_file_are_singular() -> None:
-    line = health_line({"trucks_alive": 1.0, "files": 1.0})
+    line = health_line({"trucks_alive": 1.0, "files": 1.0, "disk_free_bytes": 5e9})
     assert line.startswith("1 truck, ")
     assert ", 1 open file, " in line
     assert health_line({}).startswith("0 trucks, ")
@@ -32,3 +32,8 @@ def test_offsets_of_years_are_in_days() -> None:
         note == "clocks ahead: a by 1500.0 days; clocks behind, or all samples late: b by 1.0 days"
     )
     assert ", lag 2200.0 days (old samples" in health_line({"lag_s": 190_080_000.0})
+
+
+def test_unknown_space_is_not_zero() -> None:
+    """Before the writer has looked, a logger that had just started had `0.0 GB left`."""
+    assert health_line({"files": 2.0}).endswith(", 2 open files")
