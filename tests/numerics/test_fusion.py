@@ -13,6 +13,7 @@ from pre_core.arrays import FloatArray
 from pre_core.crossing import mismatch as mm
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.posterior import layout, log_odds_of_absence
+from pre_core.crossing.sampling import sample
 from pre_core.fusion.information import BridgePriors
 from pre_core.fusion.joint import FusedDraws, build_joint, sample_joint
 from pre_core.fusion.lateral_wander import (
@@ -332,7 +333,11 @@ def test_changed_bridge_is_distinguished_from_unchanged_one() -> None:
 def test_runs_over_a_real_road(
     shared: Path, monkeypatch: pytest.MonkeyPatch, name: str, count: int, largest_z: float
 ) -> None:
-    """Every element within its interval or nearly so, the level to a tenth (docs/fusion.md)."""
+    """Every element within its interval or nearly so, the level to a seventh.
+
+    The level was known to a tenth while surfaces were fitted where the posterior is not; 72 to 88 %
+    of the elements of surveys over twin tyres were in such intervals.
+    """
     folder = shared / "crossings" / name
     site = load_site(folder / "site.toml")
     runs: list[Optimum] = []
@@ -350,7 +355,7 @@ def test_runs_over_a_real_road(
     assert len(runs) == count
     problem = runs[0].problem
     where = layout(problem)
-    information_root = [likelihood(run) for run in runs]
+    information_root = [likelihood(run, points=sample(run, 1200, 1).points) for run in runs]
     footprints = problem.mismatch.shapes.footprints
     parts = [
         FusionInput(f"{i:02d}", of, "truck", 1, footprints, 0.01)
@@ -368,7 +373,7 @@ def test_runs_over_a_real_road(
     z = (ln_ei.mean(axis=0) - truth) / ln_ei.std(axis=0)
     assert np.abs(z).max() < largest_z
     level = ln_ei.mean(axis=1)
-    assert round(float(level.std()), 2) <= 0.1
+    assert round(float(level.std()), 2) <= 0.15
     assert abs(level.mean() - truth.mean()) < 2.5 * level.std()
     (track,) = fused.tracks
     assert track.wander_m is not None
