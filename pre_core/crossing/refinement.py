@@ -37,9 +37,10 @@ _MAX_MOVES = 4
 _TRIED_BRIDGES = 2
 """Limit of other bridges from which all parameters are fitted, after each optimum."""
 _KEPT_RIVALS = 4
-"""Limit of other bridges near which the posterior is drawn, too."""
+"""Limit of rivals: other bridges that fit nearly as well, near which draws begin, too."""
 _FAILED_ROUNDS = 2
-"""Rounds without a better bridge, ends alike and one at a time, after which no other is tried."""
+"""Number of rounds without a better bridge that end the search: one with both ends restrained or
+compliant alike (`is_even`), one with a single end."""
 _SHIFTS_M = (0.0, -1.2, 1.2)
 """Offsets from which other bridges are tried about a truck: from more than half a metre off, their
 fits may end at a wrong one."""
@@ -55,7 +56,7 @@ those of three crossings whose true bridge was found so had 0.1 to 2 times the f
 
 def refined(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> tuple[Optimum, int]:
     """Return the best of an optimum and those found from it, and the number of evaluations."""
-    if _is_sharp(found):
+    if _needs_other_bridges(found):
         return _with_other_bridge(found, strategy, max_evaluations)
     return _refine_offset(found, strategy, max_evaluations)
 
@@ -144,7 +145,7 @@ def _chi2_at_full_weight(found: Optimum) -> float:
 def _fits_about(
     around: Optimum, strategy: SearchStrategy, tried: int, *, is_even: bool
 ) -> tuple[list[Optimum], int]:
-    """Return fits from `tried` other bridges at most, and the number of evaluations.
+    """Return fits from at most `tried` other bridges, and the number of evaluations.
 
     They are completed up to `_COMPLETED_CHI2`; an accepted one is the last.
     """
@@ -185,15 +186,15 @@ def _fitted(
     return completed, used + completed.evaluations - fitted.evaluations
 
 
-def _is_sharp(found: Optimum) -> bool:
-    """Return whether bridges of other frequencies are tried: tyres of one kind, and nearly a fit.
+def _needs_other_bridges(found: Optimum) -> bool:
+    """Return whether to try bridges of other frequencies: for equal tyres and nearly a fit.
 
     They are not tried for a tandem, whose offsets have been scanned over the whole error of the
     receiver: four such searches found no other bridge with 40 % more evaluations.
     """
     mismatch = found.problem.mismatch
-    is_sharp = mismatch.level_m3.any() and has_alike_tyres(mismatch)
-    is_tried = is_sharp and not has_tandem(found.problem)
+    has_little_mismatch = mismatch.level_m3.any() and has_alike_tyres(mismatch)
+    is_tried = has_little_mismatch and not has_tandem(found.problem)
     return bool(is_tried and found.unfinished is None and found.chi2_per_dof <= HOPELESS_CHI2)
 
 
@@ -204,7 +205,9 @@ def _with_other_bridge(
     evaluations = 0
     rivals: list[OtherBridge] = []
     failed, is_even = 0, True
-    while failed < _FAILED_ROUNDS and evaluations <= max_evaluations and _is_sharp(found):
+    while (
+        failed < _FAILED_ROUNDS and evaluations <= max_evaluations and _needs_other_bridges(found)
+    ):
         others, used = other_bridges(found, strategy, is_even=is_even)
         evaluations += used
         before = found
@@ -229,12 +232,12 @@ def _refine_offset(
     for _ in range(_MAX_MOVES):
         if evaluations > max_evaluations or not found.problem.mismatch.level_m3.any():
             break
-        place, used = better_neighbour(found, strategy)
+        candidate, used = better_neighbour(found, strategy)
         evaluations += used
-        if place is None:
+        if candidate is None:
             break
         other, used = fit_all(
-            found.problem, shifted_to(found.problem, found.state.y, place), strategy
+            found.problem, shifted_to(found.problem, found.state.y, candidate), strategy
         )
         evaluations += used
         if other is None or not is_better(other, found):
@@ -244,7 +247,7 @@ def _refine_offset(
 
 
 def with_full_weight(found: Optimum, strategy: SearchStrategy, max_evaluations: int) -> Optimum:
-    """Return the better optimum, at reduced weight of the body equations or about another bridge.
+    """Return an optimum at reduced weight of the body equations, or a better one at full weight.
 
     The body equations of a linear truck contradict a wrong bridge, which is therefore accepted only
     at their reduced weight. Real friction and nonlinear springs act off the bridge, too: where a
@@ -271,7 +274,7 @@ def with_free_ends(found: Optimum, strategy: SearchStrategy) -> tuple[Optimum, i
     where, y = layout(found.problem), found.state.y
     ends = np.intersect1d(where.half_normal, where.bridge)
     is_restrained = found.unfinished is None and np.any(y[ends] > _CLEAR_RESTRAINT)
-    if not is_restrained or _is_sharp(found) or found.chi2_per_dof > HOPELESS_CHI2:
+    if not is_restrained or _needs_other_bridges(found) or found.chi2_per_dof > HOPELESS_CHI2:
         return found, 0
     start = y.copy()
     start[where.bridge] = 0.0

@@ -31,12 +31,11 @@ from pre_core.search.loop import Report
 
 _MAX_ROUNDS = 12
 """Largest number of rounds, each of which fits a surface and draws on it."""
-_TOGETHER = 100
+_BATCH_POINTS = 100
 """Number of points evaluated together: their residuals take some megabytes."""
-_STEEPEST = 30.0
-"""Largest absolute logarithm of a point's weight in a fit; the likeliest first point has weight
-1."""
-_IMPOSSIBLE = 1e6
+_MAX_LOG_WEIGHT = 30.0
+"""Limit of the absolute logarithm of a point's weight in a fit; the likeliest first point has 1."""
+_IMPOSSIBLE_RESIDUAL = 1e6
 """Residual of a point that is not possible."""
 _LEAST_SIZE = 1e-9
 """Smallest spread of a coordinate, which replaces zero."""
@@ -52,7 +51,7 @@ class DrawnDensity(NamedTuple):
     residuals: Callable[[FloatArray], FloatArray]
     """Function from points (k, d) to the residuals (m, k) there."""
     prior_squares: Callable[[FloatArray], FloatArray]
-    """Function from points (k, d) to the squares (k,) of their priors."""
+    """Function from points (k, d) to the sums of squares (k,) of their priors."""
     half_normal: NDArray[np.int64]
     """Indices of the coordinates that must not be negative."""
     log_odds: FloatArray  # (d,) of zero, as in `latent_coordinates`
@@ -78,11 +77,12 @@ class _Frame(NamedTuple):
     level: float
 
 
-class _Fitted(NamedTuple):
-    """A surface of squares, with mean and covariance of its points."""
+class _FittedSurface(NamedTuple):
+    """A surface of sums of squares, with mean and covariance of its points."""
 
     frame: _Frame
-    rows: FloatArray  # (p, p) of few residuals with the same squares
+    rows: FloatArray
+    """Coefficients (p, p) of the fewest residuals with these sums of squares."""
     mean: FloatArray  # (d,)
     root: FloatArray  # (d, d) lower triangular root of the covariance
 
@@ -96,7 +96,7 @@ class _Points(NamedTuple):
     """Points at which residuals have been evaluated, and sums of these for fits."""
 
     y: FloatArray  # (k, d)
-    squares: FloatArray  # (k,) by which draws are weighted
+    squares: FloatArray  # (k,) sums of squares, by which draws are weighted
     weight: FloatArray  # (k,) in fits
     sums: ParabolaSums
     completed: FloatArray
@@ -120,7 +120,7 @@ def residual_draws(
     level = float(log_density(density, first, np.sum(residuals**2, axis=0)).max())
     # A parameter that the site file excludes has the size zero.
     frame = _Frame(first.mean(axis=0), np.maximum(first.std(axis=0), _LEAST_SIZE), level)
-    batches, used = [_evaluated(density, frame, first, residuals)], list[_Fitted]()
+    batches, used = [_evaluated(density, frame, first, residuals)], list[_FittedSurface]()
     while True:
         report("weighting draws of the posterior", 0.5 + 0.04 * len(used))
         used.append(_fit(frame, batches))
@@ -137,11 +137,16 @@ def _residuals(density: DrawnDensity, y: FloatArray) -> FloatArray:
 
 
 def _parts(y: FloatArray) -> list[FloatArray]:
-    return [y[i : i + _TOGETHER] for i in range(0, y.shape[0], _TOGETHER)]
+    return [y[i : i + _BATCH_POINTS] for i in range(0, y.shape[0], _BATCH_POINTS)]
 
 
 def _finite(residuals: FloatArray) -> FloatArray:
-    return np.nan_to_num(residuals, nan=_IMPOSSIBLE, posinf=_IMPOSSIBLE, neginf=_IMPOSSIBLE)
+    return np.nan_to_num(
+        residuals,
+        nan=_IMPOSSIBLE_RESIDUAL,
+        posinf=_IMPOSSIBLE_RESIDUAL,
+        neginf=_IMPOSSIBLE_RESIDUAL,
+    )
 
 
 def _drawn(density: DrawnDensity, frame: _Frame, y: FloatArray) -> _Points:
@@ -152,7 +157,7 @@ def _drawn(density: DrawnDensity, frame: _Frame, y: FloatArray) -> _Points:
     points = _evaluated(density, frame, y, _finite(np.hstack([one.residuals for one in found])))
     squares = np.concatenate([one.squares for one in found])
     return points._replace(
-        squares=np.nan_to_num(squares, nan=_IMPOSSIBLE**2, posinf=_IMPOSSIBLE**2),
+        squares=np.nan_to_num(squares, nan=_IMPOSSIBLE_RESIDUAL**2, posinf=_IMPOSSIBLE_RESIDUAL**2),
         completed=np.concatenate([one.y for one in found]),
     )
 
@@ -164,12 +169,12 @@ def prior_centres(found: Optimum, coordinates: NDArray[np.int64]) -> FloatArray:
 
 
 def prior_squares(centres: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the squares (k,) of the priors at points y (k, n + 1); the offset has no prior."""
+    """Return the priors' sums of squares (k,) at points y (k, n + 1); the offset has no prior."""
     return np.asarray(np.sum((y[:, :-1] - centres) ** 2, axis=1))
 
 
 def log_density(density: DrawnDensity, y: FloatArray, squares: FloatArray) -> FloatArray:
-    """Return the log posterior (k,) at points y (k, d) with these squares (k,)."""
+    """Return the log posterior (k,) at points y (k, d) with these sums of squares (k,)."""
     return -0.5 / density.inflation**2 * (squares + density.prior_squares(y))
 
 
@@ -177,29 +182,29 @@ def _evaluated(
     density: DrawnDensity, frame: _Frame, y: FloatArray, residuals: FloatArray
 ) -> _Points:
     squares = np.sum(residuals**2, axis=0)
-    higher = (log_density(density, y, squares) - frame.level) / y.shape[1]
-    weight = np.exp(np.clip(higher, -_STEEPEST, _STEEPEST))
+    log_weight = (log_density(density, y, squares) - frame.level) / y.shape[1]
+    weight = np.exp(np.clip(log_weight, -_MAX_LOG_WEIGHT, _MAX_LOG_WEIGHT))
     sums = sums_of((y - frame.centre) / frame.size, residuals, weight)
     return _Points(y, squares, weight, sums, y)
 
 
-def _fit(frame: _Frame, batches: list[_Points]) -> _Fitted:
+def _fit(frame: _Frame, batches: list[_Points]) -> _FittedSurface:
     """Return the surface of the residuals at all points, which count by their weights."""
     rows, _ = parabolas(reduce(added, (one.sums for one in batches)))
     y = np.concatenate([one.y for one in batches])
     weight = np.concatenate([one.weight for one in batches])
     covariance = np.cov(y.T, aweights=weight) + _LEAST_SIZE**2 * np.eye(y.shape[1])
-    (few,) = qr(rows, mode="r")
-    return _Fitted(
+    (triangle,) = qr(rows, mode="r")
+    return _FittedSurface(
         frame,
-        np.asarray(few[: rows.shape[1]]),
+        np.asarray(triangle[: rows.shape[1]]),
         np.average(y, axis=0, weights=weight),
         np.asarray(np.linalg.cholesky(covariance)),
     )
 
 
 def _draws_on(
-    density: DrawnDensity, fitted: _Fitted, count: int, rng: np.random.Generator
+    density: DrawnDensity, fitted: _FittedSurface, count: int, rng: np.random.Generator
 ) -> FloatArray:
     """Return draws y (count, d) of the posterior with a surface in place of the residuals."""
     covariance = fitted.root @ fitted.root.T
@@ -214,7 +219,9 @@ def _draws_on(
     return latent.values(tempering.tempered_draws(target, mean, start, count, _MOVES, rng))
 
 
-def _weighted(density: DrawnDensity, used: list[_Fitted], batches: list[_Points]) -> WeightedDraws:
+def _weighted(
+    density: DrawnDensity, used: list[_FittedSurface], batches: list[_Points]
+) -> WeightedDraws:
     """Return all draws on the surfaces `used`, weighted as draws of their mixture."""
     y = np.concatenate([one.y for one in batches])
     squares = np.concatenate([one.squares for one in batches])

@@ -30,13 +30,15 @@ from pre_core.fusion.path_groups import FusionInput
 from pre_core.fusion.variability import variability_posterior
 
 _USUAL_CHANGE = 0.03
+"""Relative standard deviation of every element between crossings, added to the estimated one."""
 _SUSPICIOUS, _INCOMPATIBLE = 1e-3, 1e-4
-"""Probability that the worst of all crossings is as far away, below which a crossing is tested with
-the variability of the others, and below which it is then excluded."""
+"""Limits of the probability that the worst of all crossings is as far away. Below the first one a
+crossing is tested with the variability of the others; below the second one it is then excluded."""
 _FEWEST = 3
 """Fewest crossings of which one can be excluded: of two that contradict each other either may be
 wrong; of more, a third may be."""
-_UNLIKELY = 1e-6
+_NEGLIGIBLE_WEIGHT = 1e-6
+"""Posterior weight of a value of the variability below which it is omitted."""
 
 
 class ConsistencyResult(NamedTuple):
@@ -70,7 +72,9 @@ def select_consistent(
         found = variability_posterior(
             information._replace(crossings=information.select(inside)), priors
         )
-        changes = np.column_stack([found.tau, found.rho, found.weight])[found.weight > _UNLIKELY]
+        changes = np.column_stack([found.tau, found.rho, found.weight])[
+            found.weight > _NEGLIGIBLE_WEIGHT
+        ]
         of = zip(
             sorted(excluded),
             _tail_probabilities(information, priors, sorted(excluded), inside, changes),

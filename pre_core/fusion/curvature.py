@@ -22,7 +22,7 @@ _FARTHEST_OF_DIFFERENCES = 0.7
 """The same for terms in compliances, which are differences of this step about the crossing's
 optimum. Extrapolated to a size of three, they overestimate the likelihood of a bridge with a
 restrained end by a factor of e, in each of twelve runs of an independent simulator."""
-_PLACE_STEPS = 4
+_OFFSET_STEPS = 4
 """Number of Newton steps to the likeliest offset."""
 
 
@@ -61,33 +61,33 @@ def linearise_with_curvature(
     b = bends.about.size
     k = bends.shapes.shape[0]
     of_bridge, of_others = root[:, :b], root[:, b : root.shape[1] - 1 - k]
-    of_place, of_bends = root[:, -1 - k], root[:, root.shape[1] - k :]
+    of_offset, of_bends = root[:, -1 - k], root[:, root.shape[1] - k :]
     inverse = np.asarray(np.linalg.inv(bends.directions))
     farthest = farthest_of(bends)
     about = to_surface_coordinates(bends, bends.about)
     wanted = to_surface_coordinates(bends, at) - about
-    moves, places = _within_reach(bends, inverse, wanted[None, :], farthest)
-    move, place = moves[0], float(places[0])
+    moves, offsets = _within_reach(bends, inverse, wanted[None, :], farthest)
+    move, offset = moves[0], float(offsets[0])
     at = about + move
     size = float(np.linalg.norm(bends.directions[b]))
     others = cho_factor(of_others.T @ of_others + priors)
-    for _ in range(_PLACE_STEPS):
-        bend, slope = _bent(bends, inverse, move, place)
-        left = target - of_bridge @ at - of_place * place - of_bends @ bend
-        along = of_place + of_bends @ slope[:, b]
+    for _ in range(_OFFSET_STEPS):
+        bend, slope = _terms_at(bends, inverse, move, offset)
+        left = target - of_bridge @ at - of_offset * offset - of_bends @ bend
+        along = of_offset + of_bends @ slope[:, b]
         # The part of the offset's effect that the others do not explain.
         free = along - of_others @ cho_solve(others, of_others.T @ along)
         step = float(free @ left) / float(free @ along)
-        place += float(np.clip(step, -size, size))
-        place = float(np.clip(place, -farthest * size, farthest * size))
-    bend, slope = _bent(bends, inverse, move, place)
+        offset += float(np.clip(step, -size, size))
+        offset = float(np.clip(offset, -farthest * size, farthest * size))
+    bend, slope = _terms_at(bends, inverse, move, offset)
     rows_at = np.hstack([of_bridge + of_bends @ slope[:, :b], of_others])
-    along = of_place + of_bends @ slope[:, b]
-    left = target - of_bridge @ at - of_place * place - of_bends @ bend
+    along = of_offset + of_bends @ slope[:, b]
+    left = target - of_bridge @ at - of_offset * offset - of_bends @ bend
     logs = slice(b - bends.logarithms, b)
     at[logs] = np.exp(at[logs])
     rows_at[:, logs] /= at[logs]  # derivatives with respect to c, not ln c
-    left = left + rows_at[:, :b] @ at + along * place
+    left = left + rows_at[:, :b] @ at + along * offset
     along = along / np.linalg.norm(along)
     return rows_at - np.outer(along, along @ rows_at), left - along * (along @ left)
 
@@ -114,16 +114,16 @@ class CurvedForm(NamedTuple):
         if self.bends is None:
             return np.column_stack([np.ones(at.shape[0]), at])
         constant, slope, square = self._by_offset(at)
-        place = self._likeliest_offset(constant, slope, square)[:, None]
-        return constant + place * slope + place**2 * square
+        offset = self._likeliest_offset(constant, slope, square)[:, None]
+        return constant + offset * slope + offset**2 * square
 
-    def along(self, at: FloatArray) -> FloatArray:
+    def offset_projection(self, at: FloatArray) -> FloatArray:
         """Return the projection (m, m) that removes the offset's effect at a bridge (b,)."""
         unit = np.zeros(self.rows.shape[0])
         if self.bends is not None:
             constant, slope, square = self._by_offset(at[None, :])
-            place = self._likeliest_offset(constant, slope, square)[0]
-            unit = self.rows @ (slope[0] + 2.0 * place * square)
+            offset = self._likeliest_offset(constant, slope, square)[0]
+            unit = self.rows @ (slope[0] + 2.0 * offset * square)
             unit /= np.linalg.norm(unit)
         return np.asarray(np.eye(unit.size) - np.outer(unit, unit))
 
@@ -138,18 +138,18 @@ class CurvedForm(NamedTuple):
         b, k = bends.about.size, bends.shapes.shape[0]
         about = to_surface_coordinates(bends, bends.about)
         wanted = to_surface_coordinates(bends, at) - about
-        moves, place = _within_reach(bends, self.inverse, wanted, farthest_of(bends))
+        moves, offset = _within_reach(bends, self.inverse, wanted, farthest_of(bends))
         # Beyond their reach the terms continue linearly in c.
         beyond = wanted - moves
         logs = slice(b - bends.logarithms, b)
         beyond[:, logs] = np.expm1(beyond[:, logs])
         unit = self.inverse[:, b]
-        sizes = moves @ self.inverse[:, :b].T + place[:, None] * unit
+        sizes = moves @ self.inverse[:, :b].T + offset[:, None] * unit
         twice = sizes + 2.0 * (beyond @ self.inverse[:, :b].T)
         forms = self.products.reshape(k, b + 1, b + 1)
         outer = (sizes[:, :, None] * twice[:, None, :]).reshape(sizes.shape[0], -1)
         constant = np.column_stack(
-            [np.ones(at.shape[0]), about + moves + beyond, place, outer @ self.products.T]
+            [np.ones(at.shape[0]), about + moves + beyond, offset, outer @ self.products.T]
         )
         slope = np.zeros_like(constant)
         slope[:, b + 1] = 1.0
@@ -171,13 +171,13 @@ class CurvedForm(NamedTuple):
         second = np.sum(of_slope * slope, axis=1)
         bent, third, fourth = constant @ of_square, slope @ of_square, float(square @ of_square)
         moved = np.zeros(constant.shape[0])
-        for _ in range(_PLACE_STEPS):
+        for _ in range(_OFFSET_STEPS):
             gradient = first + moved * (second + 2.0 * bent)
             gradient += 3.0 * moved**2 * third + 2.0 * moved**3 * fourth
             curvature = second + 4.0 * moved * third + 4.0 * moved**2 * fourth
             moved = moved - np.clip(gradient / curvature, -size, size)
-            place = constant[:, b + 1]
-            moved = np.clip(place + moved, -largest, largest) - place
+            offset = constant[:, b + 1]
+            moved = np.clip(offset + moved, -largest, largest) - offset
         return np.asarray(moved)
 
 
@@ -223,17 +223,17 @@ def _within_reach(
     `inverse` is the inverse of the directions, `farthest` the largest size of a move.
     """
     b = bends.about.size
-    sizes, place = move @ inverse[:, :b].T, inverse[:, b]
-    sizes -= np.outer(sizes @ place, place) / (place @ place)
+    sizes, by_offset = move @ inverse[:, :b].T, inverse[:, b]
+    sizes -= np.outer(sizes @ by_offset, by_offset) / (by_offset @ by_offset)
     moved = np.clip(sizes, -farthest, farthest) @ bends.directions.T
     return moved[:, :b], moved[:, b]
 
 
-def _bent(
-    bends: CurvatureTerms, inverse: FloatArray, move: FloatArray, place: float
+def _terms_at(
+    bends: CurvatureTerms, inverse: FloatArray, move: FloatArray, offset: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the terms (k,) and their derivatives (k, b + 1) at a `move` (b,) and an offset."""
-    sizes = inverse @ np.append(move, place)
+    sizes = inverse @ np.append(move, offset)
     number = sizes.size
     first, second = np.triu_indices(number)
     bend = bends.shapes @ (sizes[first] * sizes[second])

@@ -76,7 +76,7 @@ class CurvedSum(NamedTuple):
         x[:, -e:] = np.exp(-self.sigma * y[:, -e:])
         squares = np.sum(y * y, axis=1)
         linear = np.zeros((y.shape[0], self.factor[0].shape[0]))
-        of_each = pool.map(partial(_squares_and_pull, x), self.crossings)
+        of_each = pool.map(partial(_squares_and_linear, x), self.crossings)
         for one, (of_squares, of_linear) in zip(self.crossings, of_each, strict=True):
             squares += of_squares
             linear[:, one.places] += of_linear
@@ -84,7 +84,7 @@ class CurvedSum(NamedTuple):
         return np.asarray(-0.5 * squares)
 
 
-def _squares_and_pull(x: FloatArray, crossing: _CurvedCrossing) -> tuple[FloatArray, FloatArray]:
+def _squares_and_linear(x: FloatArray, crossing: _CurvedCrossing) -> tuple[FloatArray, FloatArray]:
     """Return a crossing's squares (k,) and linear parts (k, s) of shared variables, x (k, b)."""
     features = crossing.form.features(x)
     return np.sum((features @ crossing.squares) * features, axis=1), features @ crossing.linear
@@ -155,8 +155,8 @@ def _curved_crossing(
             places.append(layout.tracks[key])
     noise = np.hstack(own)
     weight = np.asarray(np.linalg.inv(np.eye(m) + noise @ noise.T))
-    along = form.along(centre)
-    weight = np.asarray(along @ weight @ along)
+    without_offset = form.offset_projection(centre)
+    weight = np.asarray(without_offset @ weight @ without_offset)
     effects = np.hstack(shared)
     return _CurvedCrossing(
         form,
@@ -217,7 +217,7 @@ def curved_draws(
 def _covariance(y: FloatArray, near: FloatArray) -> FloatArray:
     """Return the covariance (b, b) of draws y (k, b); `near` (b, b) gives too small variances."""
     covariance = np.cov(y.T)
-    for place in np.flatnonzero(np.diag(covariance) < _LEAST_VARIANCE * np.diag(near)):
-        covariance[place] = covariance[:, place] = 0.0
-        covariance[place, place] = near[place, place]
+    for index in np.flatnonzero(np.diag(covariance) < _LEAST_VARIANCE * np.diag(near)):
+        covariance[index] = covariance[:, index] = 0.0
+        covariance[index, index] = near[index, index]
     return np.asarray(covariance)

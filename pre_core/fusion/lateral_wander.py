@@ -18,11 +18,11 @@ from pre_core.fusion.long_waves import OFF_BRIDGE_STEP_M, OffBridgeMismatch
 from pre_core.physics.road import Profile
 from pre_core.physics.surface import Footprint
 
-_APART_STEPS = 4
+_DIFFERENCE_STEPS = 4
 """Step, in values off the bridge, of the second difference that determines the shared fraction: it
 passes waves of one to four metres."""
 _MAX_SHIFT_M, _ROAD_STEP_M = 1.5, 0.05
-_PLACED_M = 0.5
+_OFFSET_SPREAD_M = 0.5
 """Prior standard deviation of a run's longitudinal offset."""
 _ALIGNMENTS, _FEWEST_RUNS = 3, 2
 """Number of rounds that align each run to the others, and fewest runs with a shared fraction."""
@@ -33,7 +33,7 @@ _LEVEL_SPREAD = 0.15
 """Relative standard deviation of the estimated level of the mismatch."""
 WANDERS_M = np.geomspace(0.01, 1.0, 25)
 """Grid of the wander."""
-_FINE = 481
+_FINE_POINTS = 481
 """Number of points of the finer grid on which the posterior is evaluated."""
 
 
@@ -69,7 +69,7 @@ def _shifts_m(heights: FloatArray, step_m: float) -> FloatArray:
 
     Their second differences over one metre are compared.
     """
-    bent = _second_difference(heights, round(_APART_STEPS * OFF_BRIDGE_STEP_M / step_m))
+    bent = _second_difference(heights, round(_DIFFERENCE_STEPS * OFF_BRIDGE_STEP_M / step_m))
     largest = round(_MAX_SHIFT_M / step_m)
     lags = sorted(range(-largest, largest + 1), key=abs)
     padded = np.pad(bent, ((0, 0), (largest, largest)), constant_values=np.nan)
@@ -80,7 +80,9 @@ def _shifts_m(heights: FloatArray, step_m: float) -> FloatArray:
             others = _mean_known(np.delete(bent, i, axis=0))
             moved = [padded[i, largest + lag : largest + lag + n] for lag in lags]
             gain = [_gain(one, others, step_m) for one in moved]
-            best = int(np.argmax(np.array(gain) - 0.5 * (np.array(lags) * step_m / _PLACED_M) ** 2))
+            best = int(
+                np.argmax(np.array(gain) - 0.5 * (np.array(lags) * step_m / _OFFSET_SPREAD_M) ** 2)
+            )
             shifts[i] = lags[best]
             bent[i] = moved[best]
     return np.asarray(shifts * step_m)
@@ -98,7 +100,7 @@ def _on_one_grid(runs: Sequence[OffBridgeMismatch | None]) -> FloatArray:
     """Return values (k, n) at common places; NaN where a run has none."""
     known = [run for run in runs if run is not None]
     if not known:
-        return np.full((len(runs), 2 * _APART_STEPS + 1), np.nan)
+        return np.full((len(runs), 2 * _DIFFERENCE_STEPS + 1), np.nan)
     first = min(round(run.begin_m / OFF_BRIDGE_STEP_M) for run in known)
     last = max(round(run.begin_m / OFF_BRIDGE_STEP_M) + run.value_m.size for run in known)
     heights = np.full((len(runs), last - first), np.nan)
@@ -144,7 +146,8 @@ def shared_fraction(
     heights = _on_one_grid(runs)
     steps = shifts_m / OFF_BRIDGE_STEP_M
     bent = _second_difference(
-        np.stack([_shifted(one, by) for one, by in zip(heights, steps, strict=True)]), _APART_STEPS
+        np.stack([_shifted(one, by) for one, by in zip(heights, steps, strict=True)]),
+        _DIFFERENCE_STEPS,
     )
     known = np.isfinite(bent)
     count = known.sum(axis=0)
@@ -188,7 +191,9 @@ def _shifted(values: FloatArray, steps: float) -> FloatArray:
 
 def _power_gain(cycles_per_m: FloatArray) -> FloatArray:
     """Return the power gain (g,) of the second difference at spatial frequencies (g,)."""
-    return np.asarray(16.0 * np.sin(np.pi * cycles_per_m * _APART_STEPS * OFF_BRIDGE_STEP_M) ** 4)
+    return np.asarray(
+        16.0 * np.sin(np.pi * cycles_per_m * _DIFFERENCE_STEPS * OFF_BRIDGE_STEP_M) ** 4
+    )
 
 
 def _implied_power(mismatch: Mismatch) -> tuple[float, float]:
@@ -215,7 +220,7 @@ def wander_posterior(mismatch: Mismatch, share: SharedFraction | None) -> Wander
         for spectra in between_runs(*mismatch.shapes.footprints)
     ]
     at = np.log(WANDERS_M)
-    fine = np.linspace(at[0], at[-1], _FINE)
+    fine = np.linspace(at[0], at[-1], _FINE_POINTS)
     score = -0.5 * ((fine - np.log(_USUAL_WANDER_M)) / _USUAL_SPREAD) ** 2
     if share is not None:
         score -= 0.5 * ((np.interp(fine, at, common) - share.value) / share.std) ** 2

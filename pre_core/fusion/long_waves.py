@@ -27,10 +27,11 @@ from pre_core.fusion.short_waves import BESIDE_M
 
 KNOT_M, ALIKE_KNOT_M = 1.25, 0.5
 """Spacing of the cubic splines' knots, for different and for equal footprints."""
-_LONG_OF_KNOT = 0.25
-"""Boundary of the long waves: about four knots. With different tyres 80 to 97 % of the information
-about a bridge lies below half of these frequencies. Equal tyres that run on laterally shifted
-paths leave short waves as large as long ones, so that waves of two metres are informative too."""
+_BOUNDARY_CYCLES_PER_KNOT = 0.25
+"""Spatial frequency at the boundary of the long waves, in cycles per knot spacing. With different
+tyres 80 to 97 % of the information about a bridge lies below half of this frequency. Equal tyres
+that run on laterally shifted paths leave short waves as large as long ones, so that waves of two
+metres are informative too."""
 _LONG_SHARE = 0.97
 """Share of the power of the longest waves that is described by coefficients; the rest stays noise
 of the crossing, because the covariance of the residuals must be positive definite."""
@@ -58,7 +59,9 @@ def knot_spacing_m(mismatch: Mismatch) -> float:
 
 def long_share(cycles_per_m: FloatArray, knot_m: float) -> FloatArray:
     """Return the share (g,) of the mismatch's power at spatial frequencies (g,) in long waves."""
-    return np.asarray(_LONG_SHARE * np.exp(-((cycles_per_m * knot_m / _LONG_OF_KNOT) ** 2)))
+    return np.asarray(
+        _LONG_SHARE * np.exp(-((cycles_per_m * knot_m / _BOUNDARY_CYCLES_PER_KNOT) ** 2))
+    )
 
 
 def covariance_of_coefficients(
@@ -75,7 +78,7 @@ def covariance_of_coefficients(
     weight[0] *= 0.5
     lags = np.arange(knots_m.size) * knot_m
     row = 1e6 * np.cos(2.0 * np.pi * np.outer(lags, cycles_per_m)) @ (weight * of)
-    row[lags > CORRELATION_LENGTH_M + 3.0 * knot_m / _LONG_OF_KNOT] = 0.0
+    row[lags > CORRELATION_LENGTH_M + 3.0 * knot_m / _BOUNDARY_CYCLES_PER_KNOT] = 0.0
     row[0] *= 1.0 + 1e-6
     places = np.arange(knots_m.size)
     return np.asarray(row[np.abs(places[:, None] - places[None, :])])

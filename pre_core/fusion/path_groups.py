@@ -24,7 +24,7 @@ from pre_core.fusion.short_waves import shared_error_roots
 from pre_core.physics.road import Profile
 from pre_core.physics.surface import Footprint
 
-_NOTHING = 1e-9
+_ROUNDED = 1e-9
 """Variance of a direction, relative to the largest, below which it is rounding."""
 
 
@@ -86,10 +86,10 @@ def path_groups(parts: Sequence[FusionInput]) -> dict[PathGroupKey, PathGroup]:
     for part in parts:
         if part.likelihood.knots_m.size:
             runs.setdefault(path_group_key(part), []).append(part)
-    return {key: _track(key, some) for key, some in runs.items()}
+    return {key: _path_group(key, some) for key, some in runs.items()}
 
 
-def _track(key: PathGroupKey, runs: list[FusionInput]) -> PathGroup:
+def _path_group(key: PathGroupKey, runs: list[FusionInput]) -> PathGroup:
     shapes = mismatch_spectra(*runs[0].footprints)
     level = np.mean([run.likelihood.level_m3 for run in runs], axis=0)
     whole = level @ shapes.density
@@ -154,5 +154,5 @@ def wave_precision(part: FusionInput, groups: Mapping[PathGroupKey, PathGroup]) 
 def low_rank_root(covariance: FloatArray) -> FloatArray:
     """Return a root (q, r) of a covariance (q, q) = root root'; its rounding errors are dropped."""
     values, vectors = np.linalg.eigh(covariance)
-    kept = values > _NOTHING * values[-1]
+    kept = values > _ROUNDED * values[-1]
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))

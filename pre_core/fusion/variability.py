@@ -27,11 +27,11 @@ _TAUS = BETWEEN_SCALE * np.array(
     [0.0, 0.05, 0.1, 0.15, 0.2, 0.27, 0.36, 0.48, 0.64, 0.85, 1.1, 1.45, 1.9, 2.5, 3.2]
 )
 _RHOS = (0.0, 0.3, 0.7, 0.93, 0.99)
-_FINER = 12
+_FINE_POINTS = 12
 """Interpolated points in a grid cell of tau, whose posterior is narrower than a cell."""
-_FIRST_TAU = 0.002
+_TAU_SHIFT = 0.002
 """Value added to tau before its logarithm, in which the evidence is smooth."""
-_AS_LIKELY = np.exp(-0.5 * 1.96**2)
+_DENSITY_AT_95 = np.exp(-0.5 * 1.96**2)
 """Density of a normal at the ends of its 95 % interval, relative to its maximum."""
 
 
@@ -141,10 +141,10 @@ def _fine_taus(log: FloatArray) -> tuple[FloatArray, FloatArray]:
     They follow from the log evidence (t, r), which is smooth between the cells; each sum is one.
     """
     edges = _edges()
-    part = (np.arange(_FINER) + 0.5) / _FINER
+    part = (np.arange(_FINE_POINTS) + 0.5) / _FINE_POINTS
     fine = edges[:-1, None] + np.diff(edges)[:, None] * part
-    smooth = interpolating_spline(np.log(_TAUS + _FIRST_TAU), log, 3)
-    density = curves_at(smooth, np.log(fine.ravel() + _FIRST_TAU)).reshape(*fine.shape, -1)
+    smooth = interpolating_spline(np.log(_TAUS + _TAU_SHIFT), log, 3)
+    density = curves_at(smooth, np.log(fine.ravel() + _TAU_SHIFT)).reshape(*fine.shape, -1)
     density -= 0.5 * (fine[:, :, None] / BETWEEN_SCALE) ** 2
     weight = np.exp(density - density.max()) * np.diff(edges)[:, None, None]
     return fine, np.moveaxis(weight / weight.sum(), 2, 1)
@@ -152,9 +152,9 @@ def _fine_taus(log: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def is_consistent_with_zero(between: VariabilityPosterior) -> bool:
     """Return whether zero variability is about as likely as the most likely value."""
-    density = between.within.reshape(_TAUS.size, len(_RHOS), _FINER).sum(axis=1)
+    density = between.within.reshape(_TAUS.size, len(_RHOS), _FINE_POINTS).sum(axis=1)
     density /= np.diff(_edges())[:, None]
-    return bool(density[0, 0] > _AS_LIKELY * density.max())
+    return bool(density[0, 0] > _DENSITY_AT_95 * density.max())
 
 
 def _edges() -> FloatArray:

@@ -18,19 +18,20 @@ from pre_core.search.importance import LogDensity
 
 _EFFECTIVE_SHARE = 0.5
 """Effective share of the draws after a step to the next density."""
-_HALVINGS = 40
+_BISECTIONS = 40
 """Number of bisections by which this step is found."""
 _MOVES = 6
 """Number of moves of every draw at each density."""
 _MAX_STEPS = 60
+"""Limit of densities on the path to the target."""
 _STEP = 2.38
 """Best length of moves along differences of draws from a normal, times the square root of twice the
 number of coordinates moved."""
 _STEP_SPREAD = 0.4
-"""Spread of the logarithm of that length."""
-_WHOLE = 0.1
-"""Share of moves by a whole difference, from peak to peak."""
-_FEW, _FEWER = 0.4, 2.0
+"""Standard deviation of the logarithm of that length."""
+_WHOLE_SHARE = 0.1
+"""Share of moves by a whole difference, which lead from peak to peak."""
+_CHANGED_SHARE, _CHANGED_NUMBER = 0.4, 2.0
 """Share of the coordinates that the second of three moves changes, and mean number that the third
 changes: the second follows curved peaks, the third switches values between zero and positive."""
 
@@ -67,42 +68,42 @@ def tempered_draws(
         return target(mean + z @ root.T)
 
     x = rng.standard_normal((count, mean.size))
-    now = _Population(x, whitened(x), _log_normal(x))
+    population = _Population(x, whitened(x), _log_normal(x))
     power = 0.0
     for _ in range(_MAX_STEPS):
         progress(0.5 * power)
-        ahead = _next_power(now, power)
-        weight = np.exp(_relative(now, ahead - power))
+        next_power = _next_power(population, power)
+        weight = np.exp(_relative(population, next_power - power))
         chosen = importance.systematic_resample(weight, count, rng)
-        now, power = _Population(*(values[chosen] for values in now)), ahead
-        now = _moved(whitened, now, power, _MOVES, rng)
+        population, power = _Population(*(values[chosen] for values in population)), next_power
+        population = _moved(whitened, population, power, _MOVES, rng)
         if power == 1.0:
             break
     found = []
-    for number, some in enumerate(moves):
+    for number, moves_before in enumerate(moves):
         progress(0.5 + 0.5 * number / len(moves))
-        now = _moved(whitened, now, 1.0, some, rng)
-        found.append(now.x)
+        population = _moved(whitened, population, 1.0, moves_before, rng)
+        found.append(population.x)
     return np.asarray(mean + np.concatenate(found) @ root.T)
 
 
-def _relative(now: _Population, step: float) -> FloatArray:
+def _relative(population: _Population, step: float) -> FloatArray:
     """Return the log weights (k,) of draws after a step of the target's power, at most zero."""
-    change = step * (now.log_target - now.log_first)
+    change = step * (population.log_target - population.log_first)
     return np.asarray(change - change.max())
 
 
-def _next_power(now: _Population, power: float) -> float:
+def _next_power(population: _Population, power: float) -> float:
     """Return the largest power of the target that leaves enough effective draws."""
 
-    def is_near(ahead: float) -> bool:
-        weight = np.exp(_relative(now, ahead - power))
+    def is_near(next_power: float) -> bool:
+        weight = np.exp(_relative(population, next_power - power))
         return float(weight.sum() ** 2) > _EFFECTIVE_SHARE * weight.size * float(weight @ weight)
 
     if is_near(1.0):
         return 1.0
     low, high = power, 1.0
-    for _ in range(_HALVINGS):
+    for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if is_near(middle) else (low, middle)
     return high
@@ -110,31 +111,36 @@ def _next_power(now: _Population, power: float) -> float:
 
 def _moved(
     target: LogDensity,
-    now: _Population,
+    population: _Population,
     power: float,
     moves: int,
     rng: np.random.Generator,
 ) -> _Population:
     """Return the population after moves that keep first^(1 - power) target^power."""
-    count, d = now.x.shape
+    count, d = population.x.shape
     for number in range(moves):
-        move = now.x[rng.integers(count, size=count)] - now.x[rng.integers(count, size=count)]
+        move = (
+            population.x[rng.integers(count, size=count)]
+            - population.x[rng.integers(count, size=count)]
+        )
         length = np.exp(_STEP_SPREAD * rng.standard_normal(count))
         coordinates = np.full(count, float(d))
         if number % 3 > 0:
-            some = rng.random((count, d)) < (_FEW if number % 3 == 1 else _FEWER / d)
-            move *= some
-            coordinates = np.maximum(some.sum(axis=1), 1.0)
+            is_changed = rng.random((count, d)) < (
+                _CHANGED_SHARE if number % 3 == 1 else _CHANGED_NUMBER / d
+            )
+            move *= is_changed
+            coordinates = np.maximum(is_changed.sum(axis=1), 1.0)
         length *= _STEP / np.sqrt(2.0 * coordinates)
-        length[rng.random(count) < _WHOLE] = 1.0
-        x = now.x + length[:, None] * move
+        length[rng.random(count) < _WHOLE_SHARE] = 1.0
+        x = population.x + length[:, None] * move
         new = _Population(x, target(x), _log_normal(x))
-        gain = power * (new.log_target - now.log_target)
-        gain += (1.0 - power) * (new.log_first - now.log_first)
-        taken = np.log(rng.random(count)) < gain
-        now = _Population(
-            np.where(taken[:, None], new.x, now.x),
-            np.where(taken, new.log_target, now.log_target),
-            np.where(taken, new.log_first, now.log_first),
+        log_ratio = power * (new.log_target - population.log_target)
+        log_ratio += (1.0 - power) * (new.log_first - population.log_first)
+        is_accepted = np.log(rng.random(count)) < log_ratio
+        population = _Population(
+            np.where(is_accepted[:, None], new.x, population.x),
+            np.where(is_accepted, new.log_target, population.log_target),
+            np.where(is_accepted, new.log_first, population.log_first),
         )
-    return now
+    return population

@@ -185,7 +185,7 @@ def test_noise_rounds_end_at_a_misfit_that_stays(
 def test_a_hopeless_fit_is_not_repeated_with_free_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     where = SimpleNamespace(half_normal=np.arange(2), bridge=np.arange(2))
     monkeypatch.setattr(refinement, "layout", lambda _: where)
-    monkeypatch.setattr(refinement, "_is_sharp", lambda _: False)
+    monkeypatch.setattr(refinement, "_needs_other_bridges", lambda _: False)
     monkeypatch.setattr(refinement, "fit_all", lambda *_: (found(1.0, 7), 7))
     for chi2, used in ((24.0, 7), (26.0, 0)):
         restrained = found(chi2, 1)._replace(state=SimpleNamespace(y=np.ones(2)))
@@ -208,7 +208,7 @@ def test_other_bridges_are_tried_until_two_sets_of_starts_fail(
     monkeypatch.setattr(frequency_continuation, "layout", lambda _: where)
     monkeypatch.setattr(posterior, "layout", lambda _: where)
     monkeypatch.setattr(refinement, "other_bridges", others)
-    monkeypatch.setattr(refinement, "_is_sharp", lambda _: True)
+    monkeypatch.setattr(refinement, "_needs_other_bridges", lambda _: True)
     monkeypatch.setattr(refinement, "complete_fit", lambda one: one)
     monkeypatch.setattr(refinement, "fit_all", lambda *_: (found(next(chi2), 1), 1))
     best, evaluations = refinement.refined(found(3.9, 1), STRATEGY, 1000)
@@ -244,7 +244,7 @@ def test_other_bridges_are_tried_under_equal_tyres_only(
     )
     monkeypatch.setattr(refinement, "has_tandem", lambda _: tandem)
     one = found(chi2, 1)._replace(problem=SimpleNamespace(mismatch=mismatch))
-    assert refinement._is_sharp(one) is is_tried
+    assert refinement._needs_other_bridges(one) is is_tried
 
 
 @pytest.mark.parametrize(
