@@ -44,7 +44,7 @@ class HealthOptions(OnTheBus):
     endpoint: str | None = endpoint_option()
     tls: Path | None = tls_option()
     realm: str = opt(
-        "realm of the service (default: live, where a logger of several realms or a pattern is)",
+        "realm of the service; a logger of several realms answers in live (default: live)",
         default="live",
     )
 
