@@ -115,7 +115,7 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     # What measured, and when.
     assert "truck-1: 9.5 t, wheelbase 4.4 m, axle loads" in text
     assert "front and rear on body and axles" in text
-    assert "Computed started at 2026-09-21 " in text
+    assert "Computation started at 2026-09-21 " in text
     assert "UTC" in text
 
 
