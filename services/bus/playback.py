@@ -26,7 +26,7 @@ DELIVERY_TIMEOUT_S = 30.0
 """Longest silence of a logger, which may have a slow disk, before it counts as gone."""
 GAP_S = 2.0
 """Longest silence of a recording that is kept where gaps are skipped."""
-_LOOK_S = 0.05
+_SIGNAL_POLL_S = 0.05
 """Interval of checks for a signal, which does not end a sleep."""
 SETTLE_S = 0.3
 """Time for the queries that every subscriber sends to a new publisher."""
@@ -146,7 +146,7 @@ class _SetBySignal(threading.Event):
     def wait(self, timeout: float | None = None) -> bool:
         end = None if timeout is None else time.monotonic() + timeout
         while not self._is_set:
-            left = _LOOK_S if end is None else min(_LOOK_S, end - time.monotonic())
+            left = _SIGNAL_POLL_S if end is None else min(_SIGNAL_POLL_S, end - time.monotonic())
             if left <= 0.0:
                 break
             time.sleep(left)

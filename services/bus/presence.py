@@ -20,7 +20,7 @@ _NAME_PART: Final = 4
 
 
 def sessions_publishing(session: zenoh.Session, where: str, timeout_s: float) -> int:
-    """Return how many other sessions publish a key, of which one should."""
+    """Return the number of other sessions that publish a key, which should have one publisher."""
     token = f"{where}/@adv/pub/"
     replies = session.liveliness().get(f"{token}**", timeout=timeout_s)
     keys = (str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
@@ -71,7 +71,7 @@ class Presence:
         return bool(self._present)
 
     def close(self) -> None:
-        """Stop looking."""
+        """Stop watching."""
         self._tokens.undeclare()  # type: ignore[no-untyped-call]
 
     def _note(self, token: str, now_s: float, *, is_there: bool) -> None:

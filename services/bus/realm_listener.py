@@ -122,8 +122,8 @@ class RealmListener:
     """A listener to one realm that also notices trucks in others.
 
     `past_s` is the duration of past measurements to receive, as far as trucks keep them; of other
-    messages come those that publishers keep. `again` returns a session to replace a stale one, or
-    None to stop listening.
+    messages come those that publishers keep. `reconnect` returns a session to replace a stale one,
+    or None to stop listening.
     """
 
     def __init__(
@@ -132,12 +132,12 @@ class RealmListener:
         realm: str,
         *,
         past_s: float = 0.0,
-        again: Callable[[], zenoh.Session | None] = lambda: None,
+        reconnect: Callable[[], zenoh.Session | None] = lambda: None,
     ) -> None:
         """Listen; raise InputError if the realm is invalid."""
         self.realm = checked_realm(realm)
         self._past_s = past_s
-        self._again = again
+        self._reconnect = reconnect
         self._seen = SeenSequences()
         self._heard_s = time.monotonic()
         self._is_open = False
@@ -204,9 +204,9 @@ class RealmListener:
                 one = self._new(received)
                 if one is not None:
                     yield one
-        self._check_hearing(is_silent=is_silent)
+        self._replace_stale(is_silent=is_silent)
 
-    def _check_hearing(self, *, is_silent: bool) -> None:
+    def _replace_stale(self, *, is_silent: bool) -> None:
         """Connect again if the connection is stale."""
         now_s = time.monotonic()
         if not is_silent:
@@ -218,7 +218,7 @@ class RealmListener:
         except StaleConnectionError as error:
             _log.warning("%s; connecting again", error)
             self.close()
-            session = self._again()
+            session = self._reconnect()
             if session is not None:
                 self._begin(session, self._past_s + time.monotonic() - self._heard_s)
 
@@ -273,7 +273,7 @@ def open_listener(
         if session is None:
             yield None
             return
-        heard = RealmListener(session, realm, past_s=past_s, again=connect)
+        heard = RealmListener(session, realm, past_s=past_s, reconnect=connect)
         try:
             yield heard
         finally:

@@ -30,9 +30,9 @@ _GAP_TRIES = 3
 """Number of requests after which a message is no longer in the publisher's cache."""
 _GAP_QUERY_TIMEOUT_S = 5.0
 """Timeout for a publisher that answers over a mobile network."""
-_MAX_HOLES_PER_ROUND = 100
+_MAX_GAPS_PER_ROUND = 100
 """Gaps requested in one round; the others follow in the next."""
-_MAX_HOLES_PER_SOURCE = 10_000
+_MAX_GAPS_PER_SOURCE = 10_000
 """Largest number of gaps noted for a publisher, because a hostile one could invent any number."""
 _MAX_SOURCES = 10_000
 """Largest number of publishers noted."""
@@ -165,34 +165,34 @@ class Subscription:
                     # The oldest: a publisher that is gone, or a hostile one that invents names.
                     del self._sources[next(iter(self._sources))]
                 found = self._sources[name] = _PublisherGaps()
-            if found.numbers.runs < _MAX_HOLES_PER_SOURCE:
+            if found.numbers.runs < _MAX_GAPS_PER_SOURCE:
                 found.numbers.add(source.source_sn)
 
     def _fill_gaps(self) -> None:
         while not self._closing.wait(_GAP_PATIENCE_S):
-            for name, hole in self._due_holes():
+            for name, gap in self._due_gaps():
                 if self._closing.is_set():
                     return
                 try:
-                    self._fetch(name, hole)
+                    self._fetch(name, gap)
                 except zenoh.ZError as error:  # the session is closing or the router gone
                     _log.debug("gap query for %s: %s", name[0], error)
 
-    def _due_holes(self) -> list[tuple[_SourceName, tuple[int, int]]]:
+    def _due_gaps(self) -> list[tuple[_SourceName, tuple[int, int]]]:
         """Return gaps that have lasted a round and were not requested too often."""
         due = []
         with self._lock:
             for name, source in self._sources.items():
-                holes = source.numbers.holes_from_zero()
-                tries = {hole: source.tries.get(hole, -1) + 1 for hole in holes}
+                gaps = source.numbers.holes_from_zero()
+                tries = {gap: source.tries.get(gap, -1) + 1 for gap in gaps}
                 source.tries = tries
-                due += [(name, hole) for hole, n in tries.items() if 0 < n <= _GAP_TRIES]
-        return due[:_MAX_HOLES_PER_ROUND]
+                due += [(name, gap) for gap, n in tries.items() if 0 < n <= _GAP_TRIES]
+        return due[:_MAX_GAPS_PER_ROUND]
 
-    def _fetch(self, name: _SourceName, hole: tuple[int, int]) -> None:
+    def _fetch(self, name: _SourceName, gap: tuple[int, int]) -> None:
         where, zid, eid = name
         replies = self._session.get(
-            f"{where}/@adv/pub/{zid}/{eid}/**?_sn={hole[0]}..{hole[1]}",
+            f"{where}/@adv/pub/{zid}/{eid}/**?_sn={gap[0]}..{gap[1]}",
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,

@@ -27,9 +27,11 @@ _VERDICTS: Final = {
 }
 """Verdicts on a router's certificate by OpenSSL's codes (X509_V_ERR_…)."""
 _SILENT: Final = (
-    "the one there does not answer the TLS handshake; was it started without --tls FOLDER?"
+    "the program there does not answer the TLS handshake; was it started without --tls FOLDER?"
 )
-_FROZEN: Final = "the one there accepts connections and answers none; is it stopped or overloaded?"
+_FROZEN: Final = (
+    "the program there accepts connections and answers none; is it stopped or overloaded?"
+)
 _REFUSALS: Final = {
     "UNKNOWN_CA": "of another authority than its own",
     "CERTIFICATE_EXPIRED": "expired",
@@ -42,7 +44,7 @@ _REFUSALS: Final = {
 
 
 def cause_of_failure(endpoint: str, tls: Path | None) -> str | None:
-    """Return in a clause why no session comes about; None if the probe does not show it.
+    """Return the cause of a failed connection as a clause; None if the probe does not show it.
 
     Only `tcp/` and `tls/` are probed. The probe waits for a few seconds at most.
     """
@@ -65,7 +67,7 @@ def _without_credentials(link: socket.socket) -> str | None:
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     try:
         with context.wrap_socket(link):
-            return "the one there requires --tls FOLDER (and tls/ in the endpoint)"
+            return "the program there requires --tls FOLDER (and tls/ in the endpoint)"
     except TimeoutError:
         return _FROZEN
     except OSError:

@@ -89,7 +89,7 @@ def test_a_connection_that_brings_nothing_is_made_anew(
     endpoint = free_endpoint()
     with open_session(listen=endpoint), open_session(connect=endpoint) as deaf:
         asked: list[bool] = []
-        listening = RealmListener(deaf, "live", again=lambda: asked.append(True) or router)
+        listening = RealmListener(deaf, "live", reconnect=lambda: asked.append(True) or router)
         publisher.put("vehicle", "truck-1", "accel", b"missed")
         listening.alive.add("truck-1")  # and its leave is not heard either
         found = gathered(listening, 1)

@@ -96,14 +96,14 @@ def test_refused_certificates_are_named(
 def test_router_that_requires_credentials_is_named(credentials: Path, tls_endpoint: str) -> None:
     with router(tls_endpoint, credentials / "logger"):
         cause = cause_of_failure(tls_endpoint.replace("tls/", "tcp/"), None)
-    assert cause == "the one there requires --tls FOLDER (and tls/ in the endpoint)"
+    assert cause == "the program there requires --tls FOLDER (and tls/ in the endpoint)"
 
 
 def test_router_without_credentials_is_named(credentials: Path, tls_endpoint: str) -> None:
     with router(tls_endpoint.replace("tls/", "tcp/"), None):
         cause = cause_of_failure(tls_endpoint, credentials / "truck-1")
     assert cause == (
-        "the one there does not answer the TLS handshake; was it started without --tls FOLDER?"
+        "the program there does not answer the TLS handshake; was it started without --tls FOLDER?"
     )
 
 
