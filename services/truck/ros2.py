@@ -97,9 +97,9 @@ def run(asked: GatewaySettings, ready: Callable[[], None] = lambda: None) -> int
         stack.callback(gateway.close)
         out = _InfoFirstPublisher(gateway, vehicle_toml(known, vehicle), truck)
         reports = _Reports(gateway, truck)
-        with _RosSubscriptions(ros_session, truck) as hearing:
+        with _RosSubscriptions(ros_session, truck) as subscriptions:
             ready()
-            _hear(hearing, truck, out, reports, stop)
+            _forward(subscriptions, truck, out, reports, stop)
         for item in truck.finish():
             out.put(item)
         reports.report(closing=True)
@@ -124,8 +124,8 @@ def _open_ros(ros: str) -> zenoh.Session:
         ) from None
 
 
-def _hear(
-    hearing: "_RosSubscriptions",
+def _forward(
+    subscriptions: "_RosSubscriptions",
     truck: Ros2Truck,
     out: "_InfoFirstPublisher",
     reports: "_Reports",
@@ -133,23 +133,23 @@ def _hear(
 ) -> None:
     logged_s = time.monotonic()
     while not stop.is_set():
-        has_heard = False
+        is_any_received = False
         for topic in truck.table.topics():
             for _ in range(_AT_ONCE):
-                heard = hearing.next(topic)
-                if heard is None:
+                message = subscriptions.next(topic)
+                if message is None:
                     break
-                has_heard = True
-                for item in hearing.taken(topic, heard):
+                is_any_received = True
+                for item in subscriptions.accept(topic, message):
                     out.put(item)
         if time.monotonic() >= logged_s + _LOG_EVERY_S:
             logged_s = time.monotonic()
-            hearing.count_drops()
+            subscriptions.count_drops()
             reports.report()
-            hearing.report_silence()
-        if not has_heard:
+            subscriptions.report_silence()
+        if not is_any_received:
             stop.wait(_PAUSE_S)
-    hearing.count_drops()
+    subscriptions.count_drops()
 
 
 class _Reports:
@@ -248,7 +248,7 @@ class _RosSubscriptions:
         self._refused: set[str] = set()
         self._latest: dict[tuple[str, bytes], int] = {}
         """Number of the last message by topic and publisher."""
-        self._heard: set[str] = set()
+        self._received_topics: set[str] = set()
         self._silent: set[str] = set()
         for topic in truck.table.topics():
             # By Zenoh's own thread: another one would need a queue before it, which has no bound in
@@ -277,8 +277,8 @@ class _RosSubscriptions:
             self._too_large[topic] += 1
             return
         attachment = None if attached is None else attached.to_bytes()
-        heard = _RosMessage(key, attachment, sample.payload.to_bytes())
-        self._waiting[topic].put(heard, size + _OVERHEAD_BYTES)
+        message = _RosMessage(key, attachment, sample.payload.to_bytes())
+        self._waiting[topic].put(message, size + _OVERHEAD_BYTES)
 
     def count_drops(self) -> None:
         """Count the messages dropped since the last call."""
@@ -290,12 +290,12 @@ class _RosSubscriptions:
             anomalies.add(topic, TOO_LARGE, too_large - self._counted_too_large[topic])
             self._counted_too_large[topic] = too_large
 
-    def taken(self, topic: str, heard: _RosMessage) -> list[Accel | GnssFix]:
+    def accept(self, topic: str, message: _RosMessage) -> list[Accel | GnssFix]:
         """Return the parts of a message that can be published now."""
         anomalies = self._truck.anomalies
         try:
-            name, reported_hash = type_and_hash(heard.key)
-            attachment = decode_attachment(heard.attachment)
+            name, reported_hash = type_and_hash(message.key)
+            attachment = decode_attachment(message.attachment)
         except ValueError as error:
             anomalies.add(topic, UNREADABLE, example=f"the first {error}")
             return []
@@ -308,17 +308,17 @@ class _RosSubscriptions:
         if problem is not None:
             self._refuse(topic, f"{one_line(problem)}; refused")
             return []
-        self._heard.add(topic)
+        self._received_topics.add(topic)
         if not self._is_next(topic, attachment.publisher, attachment.sequence):
             return []
         return self._truck.convert(
-            topic, of, heard.payload, attachment.sent_ns, attachment.publisher
+            topic, of, message.payload, attachment.sent_ns, attachment.publisher
         )
 
     def report_silence(self) -> None:
         """Log the topics without messages since the last call, once."""
         for topic in self._truck.table.topics():
-            if topic in self._heard:
+            if topic in self._received_topics:
                 self._silent.discard(topic)
             elif topic not in self._silent:
                 self._silent.add(topic)
@@ -326,7 +326,7 @@ class _RosSubscriptions:
                     "%s: nothing on %s in domain %d for %.0f s",
                     *(self._truck.table.vehicle, topic, self._truck.table.domain, _LOG_EVERY_S),
                 )
-        self._heard.clear()
+        self._received_topics.clear()
 
     def _is_next(self, topic: str, publisher: bytes, sequence: int) -> bool:
         """Count lost messages; return False for a repeated one."""

@@ -318,7 +318,7 @@ class _Segment:
 
 
 def _load(path: Path) -> tuple[_Segment | None, int]:
-    """Return a segment of an earlier boot, None if nothing is left, and the torn bytes removed."""
+    """Return a segment of an earlier boot, None if nothing is left, and the number of cut bytes."""
     content = _read_file(path, path.stat().st_size)
     boot_id = _boot_of(path, content)
     if boot_id is None:
