@@ -32,10 +32,10 @@ _CLEAN_UP_S = 2.0
 _NO_WARNING = "ignore:resource_tracker"
 _POLL_S = 0.1
 """Longest delay of the parent's end while a child works."""
-_OF_THE_GROUP = (signal.SIGINT, signal.SIGTERM)
+_GROUP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Signals that a terminal or supervisor sends to all processes of a service."""
 _NICE = 15
-"""Priority of children that run gently."""
+"""Niceness of low-priority children."""
 
 
 class ChildOutput(NamedTuple):
@@ -82,7 +82,8 @@ def run_gently(arguments: Sequence[str], closing: threading.Event) -> ChildOutpu
 def _start_resource_tracker() -> None:
     """Start the tracker of resources without its warnings: it cleans up after processes that exit.
 
-    It takes them from its start, which the first lock of multiprocessing would cause, too.
+    It inherits the warning options of the moment it starts; the first lock of multiprocessing would
+    start it with warnings.
     """
     sys.warnoptions.append(_NO_WARNING)
     try:
@@ -98,7 +99,7 @@ def group_signals_blocked() -> Iterator[None]:
     The tracker of resources would unblock them at its start, so it is started first.
     """
     _start_resource_tracker()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_THE_GROUP)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _GROUP_SIGNALS)
     try:
         yield
     finally:
@@ -107,7 +108,7 @@ def group_signals_blocked() -> Iterator[None]:
 
 def ignore_group_signals() -> None:
     """Leave the signals of a group to the parent of this process, which decides what to do."""
-    for number in _OF_THE_GROUP:
+    for number in _GROUP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 
@@ -131,9 +132,9 @@ def _end_with_parent() -> None:
 
     Otherwise it would print a traceback, or finish its work unused and wait for more for ever.
     """
-    for number in _OF_THE_GROUP:
+    for number in _GROUP_SIGNALS:
         signal.signal(number, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _OF_THE_GROUP)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _GROUP_SIGNALS)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_after, args=(parent,), name="leash", daemon=True).start()

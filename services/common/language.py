@@ -42,7 +42,7 @@ class Language(NamedTuple):
     bridge_reasons: Mapping[str, str]
     left_out: Mapping[str, str]
     details: Mapping[str, str]
-    """Parts of the details behind a reason, by the English ones."""
+    """Translations of parts of the details that follow a reason, by the English text."""
     advice: Mapping[str, str]
     """Advice for each reason of a crossing with method `pre`; see `remedy`."""
     bridge_advice: Mapping[str, str]

@@ -1,4 +1,4 @@
-"""Names that users and files give, as identifiers of keys; of crossings; and counted nouns."""
+"""Identifiers made from names of users and files, names of crossings, and counted nouns."""
 
 import re
 from collections.abc import Sequence

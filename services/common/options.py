@@ -25,7 +25,7 @@ class Option(NamedTuple):
     """An argument of the command line, which fills one field."""
 
     flags: tuple[str, ...]
-    """Spellings; the field's name for a positional argument, empty: made from the name."""
+    """Spellings; if empty, one made from the field's name. A positional argument has its name."""
     group: str
     """Title of the group in the help; empty: none."""
     alternatives: str
@@ -47,8 +47,8 @@ def opt(
     """Return the field of an option; `text` is its help, `parse` makes the value.
 
     It has no default if it is `required`; of `alternatives` that are required, one has to be given.
-    An option that is given repeatedly (`action`) has the
-    default `()`, and makes a tuple.
+    An option that may be
+    repeated (`action`) has the default `()`, and its value is a tuple.
     """
     if parse is not None:
         settings["type"] = parse

@@ -73,14 +73,14 @@ def folder_at(name: str) -> Folder:
         raise InputError(
             f"{name}: no store is known as {protocol}://, give a folder or s3://BUCKET/FOLDER"
         ) from None
-    logging.getLogger("asyncio").addFilter(_is_no_leftover)
+    logging.getLogger("asyncio").addFilter(_is_worth_logging)
     return Folder(name, files, str(root).rstrip("/"))
 
 
-def _is_no_leftover(record: logging.LogRecord) -> bool:
-    """Return whether a record is other than aiohttp's on each connection of a failed download.
+def _is_worth_logging(record: logging.LogRecord) -> bool:
+    """Return False for aiohttp's record of an unclosed connection.
 
-    The failure has a line of its own.
+    A failed download leaves one for each connection, and has a line of its own.
     """
     return not record.getMessage().startswith("Unclosed c")
 
