@@ -97,9 +97,9 @@ def response_surface(
     fitted, error, remainder = _fit_parabolas(
         (drawn - centre) / size,
         lambda some: integrated_residuals(nuisances, drawn[some], has_step=for_fusion),
+        with_remainder=for_fusion,
     )
-    noise = remainder if for_fusion else remainder[:, :0]
-    few = _root_of_squares(np.hstack([fitted, linear, waves]), error, noise)
+    few = _root_of_squares(np.hstack([fitted, linear, waves]), error, remainder)
     n = nuisances.kept.size
     ends = np.cumsum([1, n, fitted.shape[1] - 1 - n, linear.shape[1]])
     constant, slopes, products, linear, waves = np.hsplit(few, ends)
@@ -161,13 +161,13 @@ def parabolas(sums: ParabolaSums) -> tuple[FloatArray, FloatArray]:
 
 
 def _fit_parabolas(
-    u: FloatArray, values_at: Callable[[slice], FloatArray]
+    u: FloatArray, values_at: Callable[[slice], FloatArray], *, with_remainder: bool = True
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the `parabolas` of values at points u (k, n), and their remainder (m, s).
 
-    The remainder is a root of its covariance, from one in `_EVERY` points. `values_at` returns the
-    values (m, …) of some points, so that not all are in memory. Points without a finite value do
-    not count: so far away, a truck may never reach the bridge.
+    The remainder is a root of its covariance, from one in `_EVERY` points, or empty unless asked
+    for. `values_at` returns the values (m, …) of some points, so that not all are in memory. Points
+    without a finite value do not count: so far away, a truck may never reach the bridge.
     """
     some_u: list[FloatArray] = []
     some_values: list[FloatArray] = []
@@ -177,13 +177,16 @@ def _fit_parabolas(
         is_possible = np.isfinite(values).all(axis=0)
         if not is_possible.all():
             at, values = at[is_possible], values[:, is_possible]
-        some_u.append(at[::_EVERY])
-        some_values.append(values[:, ::_EVERY])
+        if with_remainder:
+            some_u.append(at[::_EVERY])
+            some_values.append(values[:, ::_EVERY])
         return sums_of(at, values)
 
     parts = [slice(first, first + _TOGETHER) for first in range(0, u.shape[0], _TOGETHER)]
     whole = reduce(added, map(sums, parts))
     fitted, error = parabolas(whole)
+    if not with_remainder:
+        return fitted, error, np.zeros((fitted.shape[0], 0))
     remainder = np.hstack(some_values) - fitted @ parabola_terms(np.concatenate(some_u)).T
     # The fit takes its number of coefficients from the degrees of freedom of all points.
     free = max(1.0, whole.points - fitted.shape[1]) / whole.points
@@ -197,15 +200,12 @@ def _root_of_squares(columns: FloatArray, error: FloatArray, noise: FloatArray) 
     replaces A. Without the subtraction, the `error` (p, p) of fitted coefficients would count as
     information on the bridge, in every crossing.
     """
-    across = noise.T @ columns
-    of_noise = noise.T @ noise
-    with_white = np.eye(noise.shape[1]) + of_noise
-    squares = columns.T @ columns - across.T @ np.linalg.solve(with_white, across)
+    across, of_noise = noise.T @ columns, noise.T @ noise
+    solved = np.linalg.solve(np.eye(noise.shape[1]) + of_noise, np.hstack([across, of_noise]))
+    squares = columns.T @ columns - across.T @ solved[:, : columns.shape[1]]
     # The error is the remainder's, so that noise reduces both by the same share.
     total = float(np.trace(of_noise))
-    share = 1.0
-    if total > 0.0:
-        share = float(np.trace(np.linalg.solve(with_white, of_noise))) / total
+    share = float(np.trace(solved[:, columns.shape[1] :])) / total if total else 1.0
     squares[: error.shape[0], : error.shape[0]] -= share * error
     values, vectors = np.linalg.eigh(squares)
     return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)

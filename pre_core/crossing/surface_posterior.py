@@ -111,7 +111,7 @@ def drawn_by_residuals(
     """Return draws weighted by the residuals, about the optimum and its rivals."""
     nuisances = nuisances_at_optimum(found, inflation, seed)
     curved = curved_coordinates(found)
-    half_normal = np.searchsorted(curved, posterior.layout(found.problem).half_normal)
+    half_normal = _half_normal(found)
     odds = posterior.log_odds_of_absence(found.problem, inflation)[nuisances.kept]
     density = DrawnDensity(
         partial(integrated_residuals, nuisances, has_step=True),
@@ -143,10 +143,7 @@ def points_about_draws(found: Optimum, weighted: WeightedDraws, seed: int) -> Fl
     Points of a normal about the optimum, or of one twice as wide, lie where the posterior is not:
     parabolas that also have to fit there are wrong where it is.
     """
-    half_normal = np.searchsorted(
-        curved_coordinates(found), posterior.layout(found.problem).half_normal
-    )
-    return _widened(weighted, half_normal, _own_generator(found, seed))
+    return _widened(weighted, _half_normal(found), _own_generator(found, seed))
 
 
 def _widened(
@@ -156,12 +153,17 @@ def _widened(
 
     Coordinates `half_normal` are reflected at zero.
     """
-    chosen = importance.systematic_resample(weighted.weights.weight, POINTS, rng)
-    points = copula_draws(weighted.y[chosen], POINTS, rng)
+    points = _unweighted(weighted, rng)
     middle = np.median(points, axis=0)
     points = middle + _BEYOND_DRAWS * (points - middle)
     points[:, half_normal] = np.abs(points[:, half_normal])
     return np.asarray(points)
+
+
+def _unweighted(weighted: WeightedDraws, rng: np.random.Generator) -> FloatArray:
+    """Return POINTS (k, n + 1), none repeated, with about the distribution of weighted draws."""
+    chosen = importance.systematic_resample(weighted.weights.weight, POINTS, rng)
+    return copula_draws(weighted.y[chosen], POINTS, rng)
 
 
 def _likely_rivals(
@@ -188,6 +190,11 @@ def curved_coordinates(found: Optimum) -> NDArray[np.int64]:
     return np.union1d(where.bridge, where.half_normal)
 
 
+def _half_normal(found: Optimum) -> NDArray[np.int64]:
+    """Return the indices, among curved coordinates, of those that must not be negative."""
+    return np.searchsorted(curved_coordinates(found), posterior.layout(found.problem).half_normal)
+
+
 def surface_points(found: Optimum, inflation: float, seed: int) -> FloatArray:
     """Return points (POINTS, n + 1) of a crossing's curved coordinates and offset, for a surface.
 
@@ -211,9 +218,7 @@ def surface_posterior(found: Optimum, inflation: float, seed: int) -> SurfacePos
     wide = draw_curved(found, first.squares, POINTS, seed, widened, may_be_absent=False)
     if not is_enough(wide.weights, POINTS):
         return first._replace(points=_points_of_normal(found, POINTS, widened, seed))
-    rng = _own_generator(found, seed)
-    resampled = wide.y[importance.systematic_resample(wide.weights.weight, POINTS, rng)]
-    points = copula_draws(resampled, POINTS, rng)
+    points = _unweighted(wide, _own_generator(found, seed))
     second = fitted(points[:POINTS_OF_DRAWS])
     return second._replace(points=points, evaluations=first.evaluations + second.evaluations)
 
