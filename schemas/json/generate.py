@@ -4,16 +4,14 @@ A schema accepts every valid file, and refuses unknown keys and wrong types. Rel
 values, such as axle loads that add up to the total mass, are the program's to check.
 """
 
-import ast
-import inspect
 import json
 import sys
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
 from pydantic import BaseModel
 
+from schemas.field_docs import field_docs
 from schemas.results import Results
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
@@ -42,7 +40,7 @@ def schema(name: str) -> dict[str, Any]:
     for of, table in tables.items():
         for values in table.get("properties", {}).values():
             values.pop("title", None)
-        for key, doc in _field_docs(known[of]).items() if of in known else ():
+        for key, doc in _docs_by_key(known[of]).items() if of in known else ():
             if key in table.get("properties", {}):
                 table["properties"][key].setdefault("description", doc)
     if name == "site":
@@ -74,23 +72,16 @@ def _models() -> dict[str, type[BaseModel]]:
     return found
 
 
-def _field_docs(model: type[BaseModel]) -> dict[str, str]:
+def _docs_by_key(model: type[BaseModel]) -> dict[str, str]:
     """Return the strings below a model's fields, by the keys of the file."""
     docs: dict[str, str] = {}
     for one in reversed(model.__mro__):
         if not (issubclass(one, BaseModel) and one.__module__.startswith("schemas.")):
             continue
-        (definition,) = ast.parse(inspect.cleandoc(f"\n{inspect.getsource(one)}")).body
-        assert isinstance(definition, ast.ClassDef)  # noqa: S101 - the source of a class
-        for field, below in pairwise(definition.body):
-            match field, below:
-                case (
-                    ast.AnnAssign(target=ast.Name(id=name)),
-                    ast.Expr(value=ast.Constant(value=str(doc))),
-                ):
-                    info = model.model_fields.get(name)
-                    key = (info.alias if info is not None else None) or name
-                    docs[key] = " ".join(doc.split())
+        for name, doc in field_docs(one):
+            info = model.model_fields.get(name)
+            key = (info.alias if info is not None else None) or name
+            docs[key] = " ".join(doc.split())
     return docs
 
 
