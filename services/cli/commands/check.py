@@ -78,14 +78,8 @@ def _check(options: CheckOptions) -> int:
     runs = sum(report.is_run for report in found)
     for report in found:
         print("\n".join(lines_of(report, is_brief=report.is_run and runs > 1)))
-    wrong, left_open = (
-        sum(
-            finding.state.value == state
-            for report in found
-            for finding in without_repetition(report.findings)
-        )
-        for state in ("wrong", "open")
-    )
+    states = [one.state.value for report in found for one in without_repetition(report.findings)]
+    wrong, left_open = states.count("wrong"), states.count("open")
     print(
         f"{wrong} wrong, {left_open} open"
         if wrong or left_open
