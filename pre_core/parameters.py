@@ -115,8 +115,8 @@ EI_1: Final = len(SCALARS)
 def table(elements: int, first_axle: int = 1) -> tuple[ParameterSpec, ...]:
     """Return the rows of theta for a bridge of `elements` elements.
 
-    `first_axle` is the number of the first of the two axles whose profiles are compared: 2 for a
-    truck with a tandem, whose rows of springs, axles and tyres are then those of axles 2 and 3.
+    `first_axle` is the number of the first of the two axles whose profiles are compared; for a
+    truck with a tandem rows of springs, axles and tyres are those of this axle and the next one.
     """
     scalars = (
         row._replace(name=f"{row.name[:-1]}{row.pair_index + first_axle}")
@@ -140,8 +140,9 @@ def unit(name: str) -> str:
         return beyond[name]
     if name.startswith(f"{ELEMENT.name}_"):
         return ELEMENT.unit
-    of_tandem = {row.name: row.unit for row in table(1, 2)}
-    return of_tandem[name] if name in of_tandem else SCALARS[index_of(name)].unit
+    stem = name.rstrip("0123456789")
+    of_axles = {row.name[:-1]: row.unit for row in SCALARS if row.key in (*PAIRS, *SPRINGS)}
+    return of_axles[stem] if stem in of_axles and stem != name else SCALARS[index_of(name)].unit
 
 
 def element_count(theta: FloatArray) -> int:

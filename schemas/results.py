@@ -355,9 +355,10 @@ def is_torsion_declared(crossing: CrossingResult) -> bool:
 def first_compared_axle(crossing: CrossingResult) -> int:
     """Return the number of the first of the two axles whose profiles were compared.
 
-    It is 2 for a truck with a tandem, whose results alone have the parameter `share`.
+    The tyres of these axles have parameters; without parameters it is 1.
     """
-    return 2 if "share" in (crossing.parameters or {}) else 1
+    names = crossing.parameters or {}
+    return min((int(name[3:]) for name in names if name.startswith("k_u")), default=1)
 
 
 def unresolved_names(crossing: CrossingResult) -> list[str]:

@@ -1,8 +1,8 @@
 """`[[vehicle.axles]]` and `[[vehicle.bogies]]` of a site file, converted to pairs for two axles.
 
 The tables describe any number of axles. Identification compares two: their values become the pairs
-[front, rear] of `[vehicle]`. A truck with an equalised tandem (`site_tandem`) keeps its tables; its
-pairs are those of the front axle and of both others together. Other trucks are refused.
+[front, rear] of `[vehicle]`. A truck with a tandem (`site_tandem`) keeps its tables; its pairs are
+those of all axles ahead of the tandem together, and of both its axles.
 """
 
 import math
@@ -11,7 +11,7 @@ from typing import Any, Final
 from schemas.site_axle_tables import MECHANICAL, TYRES, Axle, Axles
 from schemas.site_errors import error_at
 from schemas.site_numbers import UNSPRUNG_MASS_SPREAD
-from schemas.site_tandem import joined, tandem_of
+from schemas.site_tandem import tandem_of
 
 _TOTAL_MASS_SPREAD: Final = 0.01
 _LARGEST_LOAD_ERROR: Final = 0.1
@@ -55,17 +55,17 @@ def in_pairs(table: Any) -> Any:
     if len(known.axles) > 2 or known.bogies:
         if len(known.axles) == 2:
             raise error_at(
-                "bogies", "joins axles of a two-axle truck, it must join axles 2 and 3 of three"
+                "bogies", "joins axles of a two-axle truck, it must join axles of three or more"
             )
         axles = _with_tracks(known.axles, table.get("track_m"))
         tandem = tandem_of(axles, known.bogies)
         kept = {"axles": axles, "bogies": known.bogies}
-        front, rear = tandem.lead, joined(tandem)
+        front, rear = tandem.front, tandem.rear
     else:
         front, rear = known.axles
     rest = {key: value for key, value in table.items() if key not in ("axles", "bogies")}
     pairs: dict[str, Any] = {key: (getattr(front, key), getattr(rear, key)) for key in MECHANICAL}
-    pairs["wheelbase_m"] = rear.position_m
+    pairs["wheelbase_m"] = rear.position_m - front.position_m
     pairs |= _tyres(front, rear)
     if front.track_m is not None or rear.track_m is not None:
         pairs["track_m"] = _tracks(front, rear, table.get("track_m"))
@@ -197,7 +197,7 @@ def _centre_of_gravity(front: Axle, rear: Axle, table: dict[str, Any]) -> dict[s
         unsprung * front.unsprung_mass_kg / sprung,
     )
     return {
-        "front_axle_to_cg_m": rear.position_m * carried / sprung,
+        "front_axle_to_cg_m": (rear.position_m - front.position_m) * carried / sprung,
         "front_axle_to_cg_m_spread": math.hypot(*parts),
     }
 

@@ -204,7 +204,7 @@ _CHOICES: Final = {
 
 
 _TABLE_LISTS: Final = {
-    "axles": "two [[vehicle.axles]], or three: a front axle and a tandem",
+    "axles": "two [[vehicle.axles]], or more with a tandem at the end",
     "bogies.axles": "a list of the numbers of its axles, [2, 3]",
     "bogies": "one [[vehicle.bogies]], with axles = [2, 3]",
     "sensors": "at most 32 [[vehicle.sensors]]",

@@ -76,12 +76,16 @@ def check_places(
 
 
 def check_sensors(
-    sensors: tuple[PlacedSensor, ...], wheelbase_m: float, compared: tuple[int, int] = (1, 2)
+    sensors: tuple[PlacedSensor, ...],
+    forces_m: tuple[float, float],
+    compared: int = 1,
+    axles: int = 2,
 ) -> None:
     """Raise if the sensors do not give the four centre readings.
 
-    The axle readings are those of the two axles `compared`, by number. A sensor on an axle ahead of
-    these is allowed and not used.
+    `forces_m` are the distance of the front spring force behind the first axle, and that of the
+    rear one behind it. The axle readings are those of axle `compared` and the next one, of `axles`;
+    a sensor on another axle is allowed and not used.
     """
     names: set[str] = set()
     for number, sensor in enumerate(sensors):
@@ -91,9 +95,9 @@ def check_sensors(
                 f"{where}.channel", f'is "{sensor.channel}" again, a channel is one sensor'
             )
         names.add(sensor.channel)
-        if sensor.on == "axle" and (sensor.axle is None or sensor.axle > compared[1]):
+        if sensor.on == "axle" and (sensor.axle is None or sensor.axle > axles):
             value = "missing" if sensor.axle is None else str(sensor.axle)
-            numbers = "1 or 2" if compared[1] == 2 else f"1 to {compared[1]}"
+            numbers = "1 or 2" if axles == 2 else f"1 to {axles}"
             raise error_at(
                 f"{where}.axle", f"is {value}, it must be the number of an axle, {numbers}"
             )
@@ -110,9 +114,9 @@ def check_sensors(
             raise error_at(
                 f"{where}.axle", "is of a sensor on the body, remove it: position_m places it"
             )
-    for axle in compared:
+    for axle in (compared, compared + 1):
         _check_axle(sensors, axle)
-    _check_body(sensors, wheelbase_m)
+    _check_body(sensors, *forces_m)
 
 
 def _check_axle(sensors: tuple[PlacedSensor, ...], axle: int) -> None:
@@ -122,12 +126,12 @@ def _check_axle(sensors: tuple[PlacedSensor, ...], axle: int) -> None:
     _check_sides(own, f"axle {axle}")
 
 
-def _check_body(sensors: tuple[PlacedSensor, ...], wheelbase_m: float) -> None:
+def _check_body(sensors: tuple[PlacedSensor, ...], front_m: float, wheelbase_m: float) -> None:
     own = [(k, one) for k, one in enumerate(sensors) if one.on == "body"]
     if not own:
         raise error_at("sensors", "has none on the body, one near each axle is expected")
     _check_sides(own, "the body")
-    places = np.array([one.position_m for _, one in own]) / wheelbase_m
+    places = (np.array([one.position_m for _, one in own]) - front_m) / wheelbase_m
     lateral = np.array([one.lateral_m for _, one in own])
     for end, at_end in (("front", 0.0), ("rear", 1.0)):
         if _lever(places, np.zeros_like(lateral), at_end) > _LARGEST_LEVER:
@@ -137,7 +141,7 @@ def _check_body(sensors: tuple[PlacedSensor, ...], wheelbase_m: float) -> None:
                 "are expected",
             )
         if _lever(places, lateral, at_end) > _LARGEST_LEVER:
-            near = [one for one in own if (one[1].position_m or 0.0) < 0.5 * wheelbase_m]
+            near = [one for one in own if (one[1].position_m or 0.0) - front_m < 0.5 * wheelbase_m]
             if end == "rear":
                 near = [one for one in own if one not in near]
             _check_sides(near or own, f"the body near the {end} axle")

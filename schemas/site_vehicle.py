@@ -74,10 +74,10 @@ class WithSpreads(Table):
 
 
 class Vehicle(WithSpreads):
-    """A truck with two axles, or a front axle and a tandem; nominal values are from a data sheet.
+    """A truck with two axles, or with more and a tandem; nominal values are from a data sheet.
 
-    With a tandem, pairs are those of the front axle and of the tandem's axles together, and the
-    wheelbase ends at their common force.
+    With a tandem, pairs are those of all axles ahead of it together, and of both its axles; the
+    wheelbase is the distance between the spring forces of these groups.
     """
 
     later_keys: ClassVar[tuple[str, ...]] = ("axles", "bogies")
@@ -139,8 +139,14 @@ class Vehicle(WithSpreads):
 
     @property
     def tandem(self) -> Tandem | None:
-        """The tandem behind the front axle; None for a truck of two axles."""
+        """The tandem whose axles are compared; None for a truck of two axles."""
         return tandem_of(self.axles, self.bogies) if self.axles else None
+
+    @property
+    def front_force_m(self) -> float:
+        """Distance of the front spring force behind the first axle; 0 for one front axle."""
+        tandem = self.tandem
+        return 0.0 if tandem is None else tandem.front.position_m
 
     @property
     def length_m(self) -> float:
@@ -230,9 +236,14 @@ class Vehicle(WithSpreads):
                 "the tandem",
             )
         if self.sensors:
-            behind = (1, 2) if self.tandem is None else (2, 3)
             check_places(self.sensors, self.length_m, self.track_m or ())
-            check_sensors(self.sensors, self.wheelbase_m, behind)
+            tandem = self.tandem
+            check_sensors(
+                self.sensors,
+                (self.front_force_m, self.wheelbase_m),
+                1 if tandem is None else tandem.number,
+                max(2, len(self.axles)),
+            )
         _check_physics(self)
         return self
 

@@ -309,7 +309,7 @@ def parameters() -> str:
 
 
 _PLACEMENT = {
-    "wheelbase_m": "`wheelbase_m`; of a tandem, distance of axles 2 and 3",
+    "wheelbase_m": "`wheelbase_m`; of a tandem, distance of its axles",
     "position_offset_m": "slow error of the receiver",
 }
 _NOT_IN_SITE_FILE = {

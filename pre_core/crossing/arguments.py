@@ -10,12 +10,11 @@ from pre_core.crossing.rows import RESIDUALS, RowFilter, row_count
 from pre_core.kernels.lanes import LANES
 from pre_core.physics import modal_response
 from pre_core.physics.beam_basis import BeamBasis
-from pre_core.physics.tandem import NO_LEAD, Lead
+from pre_core.physics.tandem import NO_TANDEM, TandemTruck
 from pre_core.physics.torsion import GROUPS, NO_TORSION, TorsionBasis
 
 LONGEST_STRETCH = 128
 """Steps marched at a time, so that their work arrays stay in the cache."""
-_NOTHING = np.zeros(0)
 
 
 class GriddedCrossing(NamedTuple):
@@ -42,9 +41,13 @@ class GriddedCrossing(NamedTuple):
     """Sample at which the initial vibration (`EvaluationPoints.swing`) begins, before the entry by
     more than the reach of `step`."""
     torsion: TorsionBasis = NO_TORSION
-    lead: Lead = NO_LEAD
-    """Front axle of a truck with a tandem; "front" and "rear" are then the axles of the tandem."""
-    lead_acceleration: FloatArray = _NOTHING  # (n,) of that axle, zero without one: see tandem.py
+    tandem: TandemTruck = NO_TANDEM
+    """Truck with a tandem; "front" and "rear" are then the compared axles of the tandem."""
+    front_force_n: FloatArray = np.zeros((0, 0))
+    """Forces (k, n) of the front axles besides their shares of the front springs', see
+    `front_axles`."""
+    front_moment_nm: FloatArray = np.zeros(0)
+    """Moment (n,) of these forces on the body."""
 
 
 class EvaluationPoints(NamedTuple):
@@ -76,7 +79,7 @@ class Buffers(NamedTuple):
     state: FloatArray  # (groups, 2, 4)
     force: FloatArray  # (wheels, stretch, 4)
     lanes: FloatArray  # (wheels, stretch, 4): deflection by lane
-    place: FloatArray  # (wheels, n): the compared two, and that ahead of a tandem
+    place: FloatArray  # (wheels, n): the compared two, then the front axles
     part: NDArray[np.int64]  # (wheels, n)
     corrected: FloatArray  # (4, 3, n): displacement, velocity, acceleration of each channel
     load: FloatArray  # (wheels, n): contact force on the bridge, up positive
@@ -92,7 +95,8 @@ class Buffers(NamedTuple):
     end_force: FloatArray  # (2 ends, n)
     end_share: FloatArray  # (wheels, 2 ends, n)
     at_end: NDArray[np.bool_]  # (n,) whether one of these is not zero
-    under_lead: FloatArray  # (n,) deflection under the axle ahead of a tandem
+    under_front: FloatArray  # (wheels - 2, n) deflection under the front axles
+    shape: FloatArray  # (wheels - 3, stretch, 4): modes at the front axles but the first
 
 
 def allocate_buffers(crossing: GriddedCrossing, parameters: int, rows: RowFilter) -> Buffers:
@@ -100,7 +104,8 @@ def allocate_buffers(crossing: GriddedCrossing, parameters: int, rows: RowFilter
     parts, _, m = crossing.basis.cubics.shape
     groups = (m + LANES - 1) // LANES + GROUPS * crossing.torsion.ends_m.shape[0]
     n = crossing.signals.shape[2]
-    wheels = 3 if crossing.lead.ahead_m > 0.0 else 2
+    front = crossing.tandem.front.ahead_m.size
+    wheels = 2 + front
     return Buffers(
         np.zeros((m, m)),
         np.zeros((m, m)),
@@ -125,5 +130,6 @@ def allocate_buffers(crossing: GriddedCrossing, parameters: int, rows: RowFilter
         np.zeros((2, n)),
         np.zeros((wheels, 2, n)),
         np.full(n, False),
-        np.zeros(n if wheels == 3 else 0),
+        np.zeros((front, n)),
+        np.zeros((max(0, front - 1), LONGEST_STRETCH, LANES)),
     )

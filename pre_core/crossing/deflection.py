@@ -153,8 +153,8 @@ def add_deflection(
         _soften_ends(crossing, front, work.part[w], work.place[w], work.precompensated[w])
         if is_compliant:
             offset = 0.0 if w == 0 else -crossing.direction * points.wheelbase_m[k]
-            if w == 2:
-                offset = crossing.direction * crossing.lead.ahead_m
+            if w >= 2:
+                offset = crossing.direction * crossing.tandem.front.ahead_m[w - 2]
             _apply_end_steps(crossing, work, front, offset, w)
     work.state[:] = 0.0
     _set_initial_vibration(crossing, work, points.theta[k, RHO_A], points.swing[k])
@@ -186,10 +186,10 @@ def add_deflection(
             for i in range(begin, stop):
                 y = work.lanes[w, i - begin]
                 work.road[w, i] += (y[0] + y[1]) + (y[2] + y[3])
-        if work.part.shape[0] == 3:
+        for j in range(work.part.shape[0] - 2):
             for i in range(begin, stop):
-                y = work.lanes[2, i - begin]
-                work.under_lead[i] = (y[0] + y[1]) + (y[2] + y[3])
+                y = work.lanes[2 + j, i - begin]
+                work.under_front[j, i] = (y[0] + y[1]) + (y[2] + y[3])
         begin = stop
     if crossing.torsion.ends_m.shape[0] > 0:
         _quasi_static_twist(crossing, work, points, k, last)
@@ -198,7 +198,7 @@ def add_deflection(
 @inner
 def _advance(work: Buffers, begin: int, stop: int) -> None:
     """Advance all modes over the samples of a stretch in which each wheel stays in one part."""
-    if work.part.shape[0] == 3:
+    if work.part.shape[0] > 2:
         tandem.advance(work, begin, stop)
         return
     filters = ModalFilters(work.cubics, work.feedback, work.state)
@@ -235,9 +235,11 @@ def _quasi_static_twist(
         if e2 >= 0:
             own = flexibility_remainder(torsion, e2, p2, x2, e2, p2, x2)
             work.road[1, i] += flexibility * (own * work.load[1, i] + across * work.load[0, i])
-        if work.part.shape[0] == 3 and work.part[2, i] >= 0:
-            e3, p3 = work.part[2, i], work.place[2, i]
-            x3 = x1 + crossing.direction * crossing.lead.ahead_m
-            pushed = flexibility * work.load[2, i]
+        for w in range(2, work.part.shape[0]):
+            if work.part[w, i] < 0:
+                continue
+            e3, p3 = work.part[w, i], work.place[w, i]
+            x3 = x1 + crossing.direction * crossing.tandem.front.ahead_m[w - 2]
+            pushed = flexibility * work.load[w, i]
             work.road[0, i] += pushed * flexibility_remainder(torsion, e1, p1, x1, e3, p3, x3)
             work.road[1, i] += pushed * flexibility_remainder(torsion, e2, p2, x2, e3, p3, x3)

@@ -96,10 +96,10 @@ def expected_squares(problem: PosteriorProblem, y: FloatArray) -> ExpectedSquare
 def _trucks(problem: PosteriorProblem, y: FloatArray) -> tuple[list[NoisePath], FloatArray]:
     """Return the noise paths of points y (k, f), and the delays (k, 4) in s of their channels."""
     crossing, at = problem.crossing, values_of(problem, y)
-    total, lead, speed = crossing.total_mass_kg, crossing.lead, problem.mismatch.speed_m_per_s
+    total, tandem, speed = crossing.total_mass_kg, crossing.tandem, problem.mismatch.speed_m_per_s
     is_inertial = bool(problem.force.any())
     return [
-        noise_path(theta, total, float(wheelbase), is_inertial, lead, speed)
+        noise_path(theta, total, float(wheelbase), is_inertial, tandem, speed)
         for theta, wheelbase in zip(at.theta, at.wheelbase_m, strict=True)
     ], problem.priors.delay_spread_s * y[:, layout(problem).delays]
 

@@ -42,8 +42,8 @@ from pre_core.crossing.suspension_noise import (
 )
 from pre_core.crossing.whittle import maximum_likelihood_levels
 from pre_core.parameters import C_S1, C_U1, D_1, K_S1, K_U1, KAPPA, M_U1, SHARE
-from pre_core.physics import tandem
-from pre_core.physics.tandem import NO_LEAD, Lead
+from pre_core.physics import tandem as tandem_equations
+from pre_core.physics.tandem import NO_TANDEM, TandemTruck
 from pre_core.physics.vehicle import masses_above_axles
 
 _SOURCES = 6  # s1, s2, u1, u2; and the other body sensor at the front's and at the rear's moment
@@ -78,8 +78,8 @@ class NoisePath(NamedTuple):
     m_12: float
     is_inertial: bool
     """Whether the tyre force is computed from the masses above it (`arguments.GriddedCrossing`)."""
-    lead: Lead = NO_LEAD
-    """Front axle of a truck with a tandem: then the masses above are not used, and the body has no
+    tandem: TandemTruck = NO_TANDEM
+    """Truck with a tandem: then the masses above are not used, and the body has no
     equations."""
     total_mass_kg: float = 0.0
     gap_m: float = 0.0
@@ -93,16 +93,16 @@ def noise_path(
     total_mass_kg: float,
     wheelbase_m: float,
     is_inertial: bool,
-    lead: Lead = NO_LEAD,
+    tandem: TandemTruck = NO_TANDEM,
     speed_m_per_s: float = 0.0,
 ) -> NoisePath:
     """Return the noise path of theta (p,); `wheelbase_m` is between the compared axles.
 
     The speed matters only for a tandem whose axles have springs of their own.
     """
-    if lead.ahead_m > 0.0:
+    if tandem.ahead_m > 0.0:
         lag_s = wheelbase_m / speed_m_per_s if speed_m_per_s > 0.0 else 0.0
-        return NoisePath(theta, 0.0, 0.0, 0.0, True, lead, total_mass_kg, wheelbase_m, lag_s)
+        return NoisePath(theta, 0.0, 0.0, 0.0, True, tandem, total_mass_kg, wheelbase_m, lag_s)
     m_s = total_mass_kg - theta[M_U1] - theta[M_U1 + 1]
     masses = masses_above_axles(m_s, theta[D_1], wheelbase_m, theta[KAPPA])
     return NoisePath(theta, *masses, is_inertial)
@@ -110,9 +110,9 @@ def noise_path(
 
 def force_masses(truck: NoisePath) -> FloatArray:
     """Return the masses (2, 2) in kg that multiply the body's readings in the axles' forces."""
-    if truck.lead.ahead_m == 0.0:
+    if truck.tandem.ahead_m == 0.0:
         return np.array([[truck.m_11, truck.m_12], [truck.m_12, truck.m_22]])
-    load = tandem.shared_load(truck.lead, truck.theta, truck.total_mass_kg, truck.gap_m)
+    load = tandem_equations.shared_load(truck.tandem, truck.theta, truck.total_mass_kg, truck.gap_m)
     share = truck.theta[SHARE]
     return np.outer([share, 1.0 - share], [load.bogie_1, load.bogie_2])
 
@@ -130,9 +130,9 @@ def estimation_matrix(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex
     """
     s = 1j * omega
     theta = truck.theta
-    if truck.lead.ahead_m > 0.0:
-        of_tandem = tandem.profile_equations(
-            truck.lead, theta, truck.total_mass_kg, truck.gap_m, omega
+    if truck.tandem.ahead_m > 0.0:
+        of_tandem = tandem_equations.profile_equations(
+            truck.tandem, theta, truck.total_mass_kg, truck.gap_m, omega
         )
         of_tandem[3] /= REDUCED_WEIGHT_SPRING_N_PER_M
         return of_tandem
@@ -157,14 +157,14 @@ def estimation_matrix(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex
 def _responses(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex128]:
     """Return the response (3, 6, f) from the noise of six sources to displacement residuals."""
     estimation = estimation_matrix(truck, omega)
-    if not truck.lead.is_equalised:
-        return tandem.sensor_responses(estimation)
+    if not truck.tandem.is_equalised:
+        return tandem_equations.sensor_responses(estimation)
     out = np.zeros((RESIDUALS, _SOURCES, omega.size), dtype=np.complex128)
     for w, sign in ((0, 1.0), (1, -1.0)):
         # The other axle's body sensor enters at another time: sources 4 and 5.
         for source, channel in ((w, w), (2 + w, 2 + w), (4 + w, 1 - w)):
             out[0, source] = sign * estimation[w, channel]
-            if truck.lead.ahead_m == 0.0:
+            if truck.tandem.ahead_m == 0.0:
                 out[1 + w, source] = estimation[2 + w, channel]
     return out
 
@@ -192,17 +192,19 @@ def noise_spectrum(
     sources = np.concatenate([density, density[[1, 0, 3, 2]]])[: responses.shape[1]]
     weighted = responses * (sources**2)[None, :, None]
     spectrum = np.asarray(np.einsum("icf,jcf->ijf", weighted, responses.conj()))
-    if truck.lead.ahead_m > 0.0:  # residuals that are always zero get some independent noise
-        zero = [1, 2] if truck.lead.is_equalised else [1]
+    if truck.tandem.ahead_m > 0.0:  # residuals that are always zero get some independent noise
+        zero = [1, 2] if truck.tandem.is_equalised else [1]
         spectrum[zero, zero] += float(density @ density)
-    if truck.lead.ahead_m > 0.0 and force.any():
+    if truck.tandem.ahead_m > 0.0 and force.any():
         over = body_divisors(truck)[1]
         friction = (force[1] @ force_shapes(omega)) * omega**4
         spectrum[2, 2] += friction / over**2
         spectrum[0, 0] += (
             friction
             / REDUCED_WEIGHT_FACTOR
-            * tandem.friction_transfer(truck.lead, truck.theta, truck.gap_m, truck.lag_s, omega)
+            * tandem_equations.friction_transfer(
+                truck.tandem, truck.theta, truck.gap_m, truck.lag_s, omega
+            )
         )
     elif force.any():
         spectrum[[1, 2], [1, 2]] += _suspension_noise_spectra(truck, force, omega)
@@ -407,4 +409,4 @@ def suspension_equation_weight(
     low = rows.omega[rows.omega < 2.0 * np.pi * _SUSPENSION_BAND_HZ]
     sensors = _body_spectra(truck, density, no_suspension_noise(), low)
     weight = sensors / _body_spectra(truck, density, force, low)
-    return float(weight[1 if truck.lead.ahead_m > 0.0 else 0 :].mean())
+    return float(weight[1 if truck.tandem.ahead_m > 0.0 else 0 :].mean())

@@ -80,7 +80,7 @@ def rear_axle_samples_m(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
     crossing = problem.crossing
     at = points(problem, y[None, :])
     rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), crossing.direction)
-    return rear[crossing.first_row :]
+    return rear[crossing.first_row : crossing.first_row + crossing.rows]
 
 
 def rear_axle_chainage_m(problem: PosteriorProblem, y: FloatArray) -> FloatArray:

@@ -155,7 +155,7 @@ def _run_strategies(
     """
     simplest = _SIMPLEST
     if has_tandem(problem):
-        simplest = WITH_MISMATCH[0 if problem.crossing.lead.is_equalised else 1]
+        simplest = WITH_MISMATCH[0 if problem.crossing.tandem.is_equalised else 1]
     budget = _Budget(max_evaluations, WORTH_COMPLETING_CHI2)
     found = [_refine_candidates(problem, y, simplest, report, budget)]
     if _has_ended(found):
@@ -293,8 +293,8 @@ def _refine_likeliest(
     It is the result of `_no_optimum` as soon as a candidate shows that the strategy is wrong.
     """
     force = no_suspension_noise() if strategy.uses_suspension else None
-    # With the noise of a front axle ahead of a tandem, offsets metres apart would fit alike.
-    front_axle, problem = problem.front_axle, problem._replace(front_axle=None)
+    # With the noise of a tandem's front axles, offsets metres apart would fit alike.
+    front_axles, problem = problem.front_axles, problem._replace(front_axles=())
     problem, y, evaluations = _find_truck(problem, y, strategy, report, force)
     power = noise_power_ratio(problem, y)
     if power > HOPELESS_NOISE:
@@ -308,7 +308,7 @@ def _refine_likeliest(
         return _no_optimum(problem, y, evaluations, 0, has_mismatch=True)
     report("finding the bridge", 0.2)
     places, used = scan_offsets(problem, y, strategy)
-    problem, evaluations = problem._replace(front_axle=front_axle), evaluations + used
+    problem, evaluations = problem._replace(front_axles=front_axles), evaluations + used
     budget = budget._replace(evaluations=budget.evaluations - evaluations)
     best, tried, used, has_friction = _fit_candidates(problem, y, places, strategy, report, budget)
     evaluations += used

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pre_core.arrays import FloatArray
 from pre_core.crossing import mismatch as _mismatch
-from pre_core.crossing.front_axle import FrontAxleResponse, front_axle_power
+from pre_core.crossing.front_axles import FrontAxlesResponse, front_axles_power
 from pre_core.crossing.mismatch import BridgePavement, Mismatch, PeriodogramSegment
 from pre_core.crossing.noise import no_suspension_noise, noise_spectrum
 from pre_core.crossing.off_bridge import FEWEST_ROWS, rear_axle_chainage_m, rear_axle_samples_m
@@ -55,11 +55,11 @@ def estimate_pavement(
     problem: PosteriorProblem,
     y: FloatArray,
     level_m3: FloatArray,
-    front_axle: FrontAxleResponse | None = None,
+    front_axles: FrontAxlesResponse | None = None,
 ) -> BridgePavement:
     """Return the mismatch on the bridge relative to levels (s,) off it, at y (f,).
 
-    The noise from the axle ahead of a tandem has waves as short, and scales with the deck's
+    The noise from a tandem's front axles has waves as short, and scales with the deck's
     roughness.
     """
     inside = _distance_inside_m(problem, y)
@@ -73,8 +73,8 @@ def estimate_pavement(
         return BridgePavement(np.zeros(2), prior, share)
     part = _periodogram(problem, y, mismatch, middle)
     known, shape = part.sensors, part.shapes[0]
-    if front_axle is not None:
-        by_surface, by_values = front_axle_power(front_axle, middle)
+    if front_axles is not None:
+        by_surface, by_values = front_axles_power(front_axles, middle)
         known, shape = known + by_values, shape + by_surface
     length_m = middle.size * (rows.every * rows.step_s) * mismatch.speed_m_per_s
     n = np.arange(1, part.observed.size + 1) / length_m

@@ -32,7 +32,7 @@ from pre_core.crossing.residuals import (
 from pre_core.crossing.rows import RESIDUALS, RowFilter, filter_rows, row_count
 from pre_core.crossing.whitening import Whitener
 from pre_core.parameters import EI_1, K_U1, M_U1
-from pre_core.physics.tandem import Lead
+from pre_core.physics.tandem import TandemTruck
 
 # Three directions in which four gains differ; the common gain is separate.
 _CONTRASTS = np.array(
@@ -106,15 +106,15 @@ class PosteriorProblem(NamedTuple):
     """Frequencies in the residuals of the removed lines, see `lines`."""
     line_waves: FloatArray = np.zeros((0, 0))
     """(m, w) orthonormal waves of these lines."""
-    front_axle: MismatchSpectra | None = None
-    """Spectra of the profile of the axle ahead of a tandem minus that of the tandem."""
-    displaced_leads: tuple[Lead, ...] = ()
-    """Front axles, each with one declared value changed by the standard deviation of its prior."""
+    front_axles: tuple[MismatchSpectra, ...] = ()
+    """Spectra of the profile of each axle ahead of a tandem minus that of the tandem."""
+    displaced_trucks: tuple[TandemTruck, ...] = ()
+    """Trucks with one value of a front axle displaced by the standard deviation of its prior."""
 
 
 def has_tandem(problem: PosteriorProblem) -> bool:
     """Return whether a tandem's axles are compared; the body then has no equations."""
-    return problem.crossing.lead.ahead_m > 0.0
+    return problem.crossing.tandem.ahead_m > 0.0
 
 
 def layout(problem: PosteriorProblem) -> ParameterLayout:
@@ -249,7 +249,7 @@ def filtered_rear_road(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
     at = points(problem, y[None, :])
     heights, _ = roads_and_deflections(crossing, problem.works[0], at, 0)
     out = np.empty(row_count(rows, crossing.rows))
-    own = np.ascontiguousarray(heights[1, crossing.first_row :])
+    own = np.ascontiguousarray(heights[1, crossing.first_row :][: crossing.rows])
     filter_rows(rows.taps, rows.every, own, out)
     return project_out(problem.line_waves, out) if problem.lines_hz else out
 
@@ -258,13 +258,12 @@ def noise_path_at(problem: PosteriorProblem, y: FloatArray) -> tuple[NoisePath, 
     """Return the truck's noise path at y (f,), and its sensors' densities (4,) with gains."""
     at = points(problem, y[None, :])
     crossing = problem.crossing
-    wheelbase = float(at.wheelbase_m[0])
     truck = noise_path(
         at.theta[0],
         crossing.total_mass_kg,
-        wheelbase,
+        float(at.wheelbase_m[0]),
         crossing.is_inertial,
-        crossing.lead,
+        crossing.tandem,
         problem.mismatch.speed_m_per_s,
     )
     return truck, problem.density * (1.0 + at.gain[0])
@@ -272,7 +271,7 @@ def noise_path_at(problem: PosteriorProblem, y: FloatArray) -> tuple[NoisePath, 
 
 def suspension_equation_weight(problem: PosteriorProblem, y: FloatArray) -> float:
     """Return the weight of the body equations, 0 to 1, at y (f,); 0 for an equalised tandem."""
-    if has_tandem(problem) and problem.crossing.lead.is_equalised:
+    if has_tandem(problem) and problem.crossing.tandem.is_equalised:
         return 0.0
     return _noise.suspension_equation_weight(
         problem.rows, *noise_path_at(problem, y), problem.force
@@ -412,7 +411,8 @@ def road_noise(
     n = crossing.signals.shape[2]
     step = crossing.step_s
     spread = problem.density * np.sqrt(0.5 / step)
-    truck = noise_path(theta, crossing.total_mass_kg, float(at.wheelbase_m[0]), True, crossing.lead)
+    total, tandem = crossing.total_mass_kg, crossing.tandem
+    truck = noise_path(theta, total, float(at.wheelbase_m[0]), True, tandem)
     force = force_masses(truck)
     x, *_ = _align_profiles(crossing, at, np.zeros(n), np.zeros(n))
     on_bridge = (x >= 0.0) & (x <= crossing.span_m)

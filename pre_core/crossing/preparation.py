@@ -11,11 +11,11 @@ from pre_core.crossing import lines
 from pre_core.crossing.arguments import EvaluationPoints, GriddedCrossing, allocate_buffers
 from pre_core.crossing.channels import A, GainsAndDelays, ModelSignals, channel_signals
 from pre_core.crossing.errors_in_variables import ComparedStretch, mismatch_power
-from pre_core.crossing.front_axle import (
-    FrontAxleResponse,
-    front_axle_response,
-    with_lead_motion,
-    without_front_axle,
+from pre_core.crossing.front_axles import (
+    FrontAxlesResponse,
+    front_axles_response,
+    with_front_forces,
+    without_front_axles,
 )
 from pre_core.crossing.mismatch import BridgePavement, Mismatch, mismatch_spectra, with_axle_roll
 from pre_core.crossing.noise import (
@@ -48,7 +48,7 @@ from pre_core.crossing.whitening import Whitener, solve, whitener
 from pre_core.parameters import FIRST_OF_BRIDGE, K_U1, M_U1, TORSION
 from pre_core.physics.beam_basis import beam_basis, change_basis
 from pre_core.physics.surface import TYPICAL_FOOTPRINTS, Footprint
-from pre_core.physics.tandem import NO_LEAD, Lead
+from pre_core.physics.tandem import NO_TANDEM, TandemTruck
 from pre_core.physics.torsion import NO_TORSION, TorsionBasis, torsion_basis
 
 _KNOT_S = 0.4
@@ -87,13 +87,13 @@ class CrossingInputs(NamedTuple):
     """Speed of torsional waves; positive where the deck may twist."""
     lane_factor: float = 1.0
     """Squared ratio of this run's distance from the bridge's axis to that of torsion's prior."""
-    lead: Lead = NO_LEAD
-    """Front axle of a truck with a tandem. Fixes, wheelbase, footprints and the last two signals
-    are then those of the tandem, whose first axle is the front one."""
-    lead_footprint: Footprint = TYPICAL_FOOTPRINTS[0]
-    """Footprint of that front axle."""
-    displaced_leads: tuple[Lead, ...] = ()
-    """Front axles, each with one declared value changed by the standard deviation of its prior."""
+    tandem: TandemTruck = NO_TANDEM
+    """Truck with a tandem. Fixes, wheelbase, footprints and the last two signals are then those of
+    the compared axles."""
+    front_footprints: tuple[Footprint, ...] = ()
+    """Footprints of the axles ahead of the tandem."""
+    displaced_trucks: tuple[TandemTruck, ...] = ()
+    """Trucks with one value of a front axle displaced by the standard deviation of its prior."""
 
 
 def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]:
@@ -120,14 +120,14 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
             crossing.total_mass_kg,
             inputs.priors.wheelbase_m,
             False,
-            crossing.lead,
+            crossing.tandem,
             speed,
         ),
         inputs.density_m_per_s2_per_rthz,
         no_suspension_noise(),
     )
     shapes = mismatch_spectra(*inputs.footprints)
-    if inputs.lead.ahead_m > 0.0:
+    if inputs.tandem.ahead_m > 0.0:
         hop_hz = np.sqrt(theta[K_U1] / theta[M_U1]) / (2.0 * np.pi)
         shapes = with_axle_roll(shapes, float(hop_hz), speed)
     problem = PosteriorProblem(
@@ -144,12 +144,10 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
         values,
         np.zeros(0),
         tuple(allocate_buffers(crossing, theta.size, row) for _ in range(inputs.threads)),
-        front_axle=(
-            mismatch_spectra(inputs.lead_footprint, inputs.footprints[0])
-            if inputs.lead.ahead_m > 0.0
-            else None
+        front_axles=tuple(
+            mismatch_spectra(one, inputs.footprints[0]) for one in inputs.front_footprints
         ),
-        displaced_leads=inputs.displaced_leads,
+        displaced_trucks=inputs.displaced_trucks,
     )
     return problem, starting_point(problem, best)
 
@@ -157,7 +155,9 @@ def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]
 def _gridded(inputs: CrossingInputs, model: ModelSignals, front_m: FloatArray) -> GriddedCrossing:
     """Return the crossing on the grid of `model`, with the front axle at chainages `front_m` (n,).
 
-    Residuals begin where the rear axle has passed the chainage at which the front axle begins.
+    Residuals begin where the rear axle has passed the chainage at which the front axle begins. The
+    forces of several axles ahead of a tandem follow from the road under them (`front_axles`), so
+    residuals end where the first of these is on the last road that the tandem measures.
     """
     n = front_m.size
     basis = beam_basis(
@@ -168,6 +168,9 @@ def _gridded(inputs: CrossingInputs, model: ModelSignals, front_m: FloatArray) -
     )
     travel = front_m if inputs.direction > 0 else inputs.span_m - front_m
     first = int(np.searchsorted(travel - inputs.priors.wheelbase_m, travel[0] + _MARGIN_M))
+    ahead_m, stop = inputs.tandem.front.ahead_m, n
+    if ahead_m.size > 1:
+        stop = int(np.searchsorted(travel + ahead_m.max(), travel[-1]))
     crossing = GriddedCrossing(
         model.step_s,
         model.signals,
@@ -179,13 +182,14 @@ def _gridded(inputs: CrossingInputs, model: ModelSignals, front_m: FloatArray) -
         change_basis(basis, inputs.priors.theta),
         np.concatenate([[0.0], np.cumsum(basis.lengths_m)]),
         first,
-        n - first,
+        stop - first,
         sinc_table(),
         step_table(),
         False,
         0,
         _torsion(inputs, basis.lengths_m),
-        inputs.lead,
+        inputs.tandem,
+        np.zeros((inputs.tandem.front.ahead_m.size, n)),
         np.zeros(n),
     )
     return crossing._replace(swing_sample=swing_sample(crossing, front_m))
@@ -211,7 +215,8 @@ def swing_sample(crossing: GriddedCrossing, front: FloatArray) -> int:
     `front` are the chainages (n,) of the first of the compared axles.
     """
     begin, sign = (0.0, 1.0) if crossing.direction > 0 else (crossing.span_m, -1.0)
-    entry = int(np.searchsorted(sign * front + crossing.lead.ahead_m, sign * begin))
+    ahead_m = float(crossing.tandem.front.ahead_m.max(initial=0.0))
+    entry = int(np.searchsorted(sign * front + ahead_m, sign * begin))
     return max(0, entry - round(_SWING_BEFORE_S / crossing.step_s))
 
 
@@ -235,8 +240,8 @@ def update_noise(
     where = layout(problem)
     coordinates = where.gains.stop
     if has_tandem(problem):
-        force = no_suspension_noise() if problem.crossing.lead.is_equalised else force
-        problem = with_lead_motion(problem, y)
+        force = no_suspension_noise() if problem.crossing.tandem.is_equalised else force
+        problem = with_front_forces(problem, y)
     if force is None:
         body = filtered_rows(problem, y)[1:]
         force = suspension_noise_levels(
@@ -247,9 +252,9 @@ def update_noise(
         if mismatch.any():
             mismatch = levels_at(problem, y)
     differs = bool(mismatch.any())
-    front_axle = front_axle_response(problem, y)
+    front_axles = front_axles_response(problem, y)
     if differs and pavement is None:
-        pavement = estimate_pavement(problem, y, mismatch, front_axle)
+        pavement = estimate_pavement(problem, y, mismatch, front_axles)
     road = problem.mismatch._replace(level_m3=mismatch, pavement=pavement if differs else None)
     at, trucks = _displaced_points(problem, y, coordinates, is_inertial=bool(force.any()))
     density = problem.density * (1.0 + at.gain)
@@ -257,7 +262,7 @@ def update_noise(
     residual_force = REDUCED_WEIGHT_FACTOR * force
     profile_noise = road if differs else None
     noise = whitener(problem.rows, count, trucks[0], density[0], residual_force, profile_noise)
-    noise = _with_local_noise(problem._replace(mismatch=road), y, noise, front_axle)
+    noise = _with_local_noise(problem._replace(mismatch=road), y, noise, front_axles)
     changed = problem._replace(force=force, mismatch=road)
     slope = _noise_gradient(changed, trucks, density)
     if differs:
@@ -304,7 +309,7 @@ def replace_mismatch(
 ) -> PosteriorProblem:
     """Return the problem with another mismatch, or none, in its noise at y (f,).
 
-    The noise from the axle ahead of a tandem has `runs` times its power.
+    The noise from a tandem's front axles has `runs` times its power.
     """
     truck, density = noise_path_at(problem, y)
     noise = whitener(
@@ -315,22 +320,22 @@ def replace_mismatch(
         REDUCED_WEIGHT_FACTOR * problem.force,
         mismatch,
     )
-    front_axle = front_axle_response(problem, y)
-    return problem._replace(noise=_with_local_noise(problem, y, noise, front_axle, runs))
+    front_axles = front_axles_response(problem, y)
+    return problem._replace(noise=_with_local_noise(problem, y, noise, front_axles, runs))
 
 
 def _with_local_noise(
     problem: PosteriorProblem,
     y: FloatArray,
     noise: Whitener,
-    front_axle: FrontAxleResponse | None,
+    front_axles: FrontAxlesResponse | None,
     runs: float = 1.0,
 ) -> Whitener:
-    """Return the whitener that removes lines and joints, with noise of a tandem's front axle."""
+    """Return the whitener that removes lines and joints, with the noise of front axles."""
     noise = _without_lines(problem, noise)
     if problem.mismatch.level_m3.any():
         noise = without_joints(problem, y, noise)
-    return without_front_axle(problem, front_axle, noise, runs)
+    return without_front_axles(problem, front_axles, noise, runs)
 
 
 def strongest_line_at_hz(problem: PosteriorProblem, y: FloatArray) -> float:
@@ -390,10 +395,10 @@ def _displaced_points(
     near = np.repeat(y[None, :], 1 + count, axis=0)
     near[np.arange(1, 1 + count), np.arange(count)] += _SLOPE_STEP
     at = points(problem, near)
-    total, lead = problem.crossing.total_mass_kg, problem.crossing.lead
+    total, tandem = problem.crossing.total_mass_kg, problem.crossing.tandem
     speed = problem.mismatch.speed_m_per_s
     return at, [
-        noise_path(theta, total, float(wheelbase), is_inertial, lead, speed)
+        noise_path(theta, total, float(wheelbase), is_inertial, tandem, speed)
         for theta, wheelbase in zip(at.theta, at.wheelbase_m, strict=True)
     ]
 

@@ -124,8 +124,8 @@ def _locate(crossing: GriddedCrossing, work: Buffers, front: FloatArray, wheelba
     n = front.size
     for w in range(work.part.shape[0]):
         offset = 0.0 if w == 0 else -crossing.direction * wheelbase
-        if w == 2:
-            offset = crossing.direction * crossing.lead.ahead_m
+        if w >= 2:
+            offset = crossing.direction * crossing.tandem.front.ahead_m[w - 2]
         e = 0 if crossing.direction > 0 else parts - 1
         for i in range(n):
             x = front[i] + offset
@@ -237,7 +237,7 @@ def _evaluate(
     for k in range(part[0], part[1]):
         row = out[k]
         if not (
-            _is_possible(points.theta[k], points.wheelbase_m[k], crossing.lead.readings_apart_m)
+            _is_possible(points.theta[k], points.wheelbase_m[k], crossing.tandem.readings_apart_m)
             and _roads(crossing, work, points, k)
         ):
             row[:] = np.nan
@@ -266,11 +266,11 @@ def _evaluate(
 
 
 @inner
-def _is_possible(theta: FloatArray, wheelbase_m: float, lead_base_m: float) -> bool:
+def _is_possible(theta: FloatArray, wheelbase_m: float, readings_apart_m: float) -> bool:
     for i in range(theta.size):
         if not np.isfinite(theta[i]):
             return False
-    return theta[D_1] < max(wheelbase_m, lead_base_m)
+    return theta[D_1] < max(wheelbase_m, readings_apart_m)
 
 
 @inner
@@ -286,7 +286,7 @@ def _roads(crossing: GriddedCrossing, work: Buffers, points: EvaluationPoints, k
     )
     gravity = 1.0 / points.common_gain[k]
     speeding = points.acceleration_m_per_s2[k]
-    if work.part.shape[0] == 3:
+    if work.part.shape[0] > 2:
         gap = points.wheelbase_m[k]
         tandem.wheels(crossing, work, points.theta[k], gap, gravity, speeding)
     else:

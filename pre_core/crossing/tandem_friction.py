@@ -13,10 +13,10 @@ def tandem_friction(problem: PosteriorProblem, y: FloatArray) -> float:
     matter.
     """
     crossing = problem.crossing
-    if not has_tandem(problem) or crossing.lead.is_equalised:
+    if not has_tandem(problem) or crossing.tandem.is_equalised:
         return 0.0
     at = points(problem, y[None, :])
     gap = float(at.wheelbase_m[0])
-    load = shared_load(crossing.lead, at.theta[0], crossing.total_mass_kg, gap)
+    load = shared_load(crossing.tandem, at.theta[0], crossing.total_mass_kg, gap)
     static = load.bogie_kg * crossing.gravity_m_per_s2
     return float(force_rms_n(problem.force)[1] / static)

@@ -23,7 +23,7 @@ from scipy.linalg import cho_factor, cho_solve, qr
 
 from pre_core import parameters
 from pre_core.arrays import FloatArray
-from pre_core.crossing import front_axle, posterior
+from pre_core.crossing import front_axles, posterior
 from pre_core.crossing.compliances import (
     MISMATCH_BIAS_SPREAD,
     marginal,
@@ -150,14 +150,15 @@ def _in_fusion(
 ) -> tuple[posterior.PosteriorProblem, levenberg_marquardt.LMState]:
     """Return problem and state at an optimum, with the noise that a run in a fusion has.
 
-    Long waves of the mismatch are parameters, and the noise from a tandem's front axle is shared.
+    Long waves of the mismatch are parameters, and the noise from a tandem's front axles is
+    shared.
     """
     problem, y = found.problem, found.state.y
     differs = bool(problem.mismatch.level_m3.any())
     if not (differs or posterior.has_tandem(problem)):
         return problem, found.state
     short = short_wave_part(problem.mismatch) if differs else None
-    problem = replace_mismatch(problem, y, short, front_axle.RUNS)
+    problem = replace_mismatch(problem, y, short, front_axles.RUNS)
     state = levenberg_marquardt.initial_state(lambda at: posterior.all_rows(problem, at), y)
     return problem, state
 
@@ -271,8 +272,8 @@ def _as_root(precision: FloatArray, linear: FloatArray) -> tuple[FloatArray, Flo
 def _coordinates(problem: posterior.PosteriorProblem, places: NDArray[np.int64]) -> Coordinates:
     """Return the coordinates at indices of y; wheelbase and common gain come last."""
     priors, where = problem.priors, posterior.layout(problem)
-    first_axle = 2 if posterior.has_tandem(problem) else 1
-    table = parameters.table(parameters.element_count(priors.theta), first_axle)
+    elements = parameters.element_count(priors.theta)
+    table = parameters.table(elements, problem.crossing.tandem.front.share.size + 1)
     kept = np.flatnonzero(priors.estimated)
     of_truck = {
         where.wheelbase: ("wheelbase", priors.wheelbase_m, priors.wheelbase_spread),

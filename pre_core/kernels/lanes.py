@@ -7,7 +7,9 @@ loops over arrays. None of the functions allocates.
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
+from pickle import UnpicklingError
 from typing import Any, TypeVar, cast
 
 from numba import config, njit
@@ -18,6 +20,9 @@ from pre_core.arrays import FloatArray
 # It changes speed alone. The cache of compiled kernels does not know the flag, so every kernel is
 # compiled by `compiled` below, and none before this line.
 setattr(config, "SLP_VECTORIZE", 1)  # noqa: B010 - the type stubs do not know it
+
+_UNREADABLE = (AttributeError, ImportError, EOFError, TypeError, ValueError, UnpicklingError)
+"""Errors of unpickling code that another version of the program stored, or a damaged file."""
 
 Lanes = tuple[float, float, float, float]
 
@@ -47,22 +52,32 @@ def compiled(**options: Any) -> Callable[[Function], Function]:
 def _store_if_possible(dispatcher: Any) -> None:
     """Let numba store a kernel's machine code; without permission or room, it stores nothing.
 
-    The process then compiles the kernel itself: a full disk must not cost a crossing.
+    The process then compiles the kernel itself: a full disk must not cost a crossing. So it does
+    where stored code is damaged, or names a type that this version of the program does not have.
     """
     try:
         dispatcher.enable_caching()
     except RuntimeError:
         _warn_without_cache("no folder for them can be written; NUMBA_CACHE_DIR names another")
         return
-    save = dispatcher._cache.save_overload
+    cache = dispatcher._cache
+    load, save = cache.load_overload, cache.save_overload
+
+    def load_if_possible(signature: object, target: object) -> object:
+        try:
+            return load(signature, target)
+        except _UNREADABLE:
+            with suppress(OSError):
+                cache.flush()
+            return None
 
     def save_if_possible(signature: object, code: object) -> None:
         try:
             save(signature, code)
-        except OSError as error:
-            _warn_without_cache(error.strerror or str(error))
+        except (OSError, *_UNREADABLE) as error:
+            _warn_without_cache(getattr(error, "strerror", None) or str(error))
 
-    dispatcher._cache.save_overload = save_if_possible
+    cache.load_overload, cache.save_overload = load_if_possible, save_if_possible
 
 
 def _warn_without_cache(cause: str) -> None:

@@ -129,11 +129,14 @@ def middle_site(site: Site) -> Site:
 
 def _middle_sensors(sensor: Sensor, vehicle: Vehicle) -> tuple[PlacedSensor, ...]:
     """Return the four readings of a truck with a tandem as sensors in the middle."""
+    front_m, first = vehicle.front_force_m, first_axle(vehicle)
     places: tuple[dict[str, Any], ...] = (
-        {"channel": "sprung_front", "on": "body", "position_m": 0.0},
-        {"channel": "sprung_rear", "on": "body", "position_m": vehicle.wheelbase_m},
-        {"channel": "unsprung_2", "on": "axle", "axle": 2},
-        {"channel": "unsprung_3", "on": "axle", "axle": 3},
+        {"channel": "sprung_front", "on": "body", "position_m": front_m},
+        {"channel": "sprung_rear", "on": "body", "position_m": front_m + vehicle.wheelbase_m},
+        *(
+            {"channel": f"unsprung_{axle}", "on": "axle", "axle": axle}
+            for axle in (first, first + 1)
+        ),
     )
     return tuple(
         PlacedSensor(**place, noise_density_ug_per_rthz=density, rate_hz=rate)
@@ -192,7 +195,7 @@ def one_sided_channels(vehicle: Vehicle, there: Collection[str]) -> str:
     left = tuple(one for one in vehicle.sensors if one.channel in there)
     if not left:
         return ""
-    weights = _reduction(left, vehicle.wheelbase_m, first_axle(vehicle)).weights
+    weights = _reduction_of(vehicle, left).weights
     parts = {
         part
         for part, row in zip((BODY, BODY, 1, 2), weights, strict=True)
@@ -204,30 +207,39 @@ def one_sided_channels(vehicle: Vehicle, there: Collection[str]) -> str:
 
 def first_axle(vehicle: Vehicle) -> int:
     """Return the number of the first of the two axles whose profiles are compared."""
-    return 1 if vehicle.tandem is None else 2
+    return 1 if vehicle.tandem is None else vehicle.tandem.number
 
 
 def reduction_of(vehicle: Vehicle) -> Reduction:
     """Return the reduction of a vehicle's sensors to middle readings; densities in µg/√Hz."""
-    return _reduction(vehicle.sensors, vehicle.wheelbase_m, first_axle(vehicle))
+    return _reduction_of(vehicle, vehicle.sensors)
+
+
+def _reduction_of(vehicle: Vehicle, sensors: tuple[PlacedSensor, ...]) -> Reduction:
+    forces_m = (vehicle.front_force_m, vehicle.wheelbase_m)
+    return _reduction(sensors, forces_m, first_axle(vehicle))
 
 
 @lru_cache(maxsize=64)
-def _reduction(sensors: tuple[PlacedSensor, ...], wheelbase_m: float, first: int = 1) -> Reduction:
+def _reduction(
+    sensors: tuple[PlacedSensor, ...], forces_m: tuple[float, float], first: int
+) -> Reduction:
+    """Return the reduction to the body's motion above both spring forces, and to two axles."""
+    front_m, wheelbase_m = forces_m
     places = SensorPlaces(
         np.array([_part(one, first) for one in sensors]),
-        np.array([one.position_m or 0.0 for one in sensors]),
+        np.array([(one.position_m or 0.0) - front_m for one in sensors]),
         np.array([one.lateral_m for one in sensors]),
     )
     density = np.array([one.noise_density_ug_per_rthz for one in sensors])
     return centre_reduction(places, density, wheelbase_m, IN_THE_MIDDLE_M)
 
 
-def _part(sensor: PlacedSensor, first: int = 1) -> int:
-    """Return the part of a sensor: `BODY`, 1 or 2 for the compared axles, -1 for one before."""
+def _part(sensor: PlacedSensor, first: int) -> int:
+    """Return the part of a sensor: `BODY`, 1 or 2 for the compared axles, -1 for another axle."""
     if sensor.axle is None:
         return BODY
-    return sensor.axle - first + 1 if sensor.axle >= first else -1
+    return sensor.axle - first + 1 if sensor.axle in (first, first + 1) else -1
 
 
 def disagreement(
@@ -287,7 +299,7 @@ def _are_mirrored(one: PlacedSensor, other: PlacedSensor) -> bool:
     """Return whether two sensors are left and right of one another."""
     far = max(abs(one.lateral_m), abs(other.lateral_m))
     return (
-        _part(one) == _part(other)
+        one.axle == other.axle
         and one.lateral_m * other.lateral_m < 0.0
         and abs(one.lateral_m + other.lateral_m) <= 0.2 * far
         and abs((one.position_m or 0.0) - (other.position_m or 0.0)) <= 0.5

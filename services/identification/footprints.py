@@ -2,13 +2,23 @@
 
 from typing import Final
 
+import numpy as np
+
 from pre_core.physics.surface import TYPICAL_FOOTPRINTS, Footprint
-from pre_core.physics.tandem import NO_LEAD, Lead
+from pre_core.physics.tandem import NO_TANDEM, FrontAxles, TandemTruck
 from schemas.site import Vehicle
 from schemas.site_axle_tables import TYRES, Axle
 
 _TRACK_M: Final = 1.83
 """Track of axles with twin tyres."""
+_OF_FRONT: Final = (
+    "unsprung_mass_kg",
+    "tyre_stiffness_n_per_m",
+    "tyre_damping_ns_per_m",
+    "suspension_stiffness_n_per_m",
+    "suspension_damping_ns_per_m",
+)
+"""Keys of an axle ahead of a tandem that `FrontAxles` has, too."""
 
 
 def footprints_of(
@@ -38,53 +48,59 @@ def footprints_of(
     return axles[0], axles[1]._replace(offset_m=vehicle.rear_axle_offset_m or 0.0)
 
 
-def lead_footprint_of(vehicle: Vehicle) -> Footprint:
-    """Return the footprint of the axle ahead of a tandem, with that of the tandem's first one.
+def front_footprints_of(vehicle: Vehicle) -> tuple[Footprint, ...]:
+    """Return the footprints of the axles ahead of a tandem, beside that of the tandem's first one.
 
-    For a truck of two axles it is the typical front axle's.
+    There are none for a truck of two axles.
     """
     tandem = vehicle.tandem
     if tandem is None:
-        return TYPICAL_FOOTPRINTS[0]
-    lead, first = _of_axle(tandem.lead, "single"), _of_axle(tandem.first)
-    return lead._replace(offset_m=lead.offset_m - first.offset_m)
+        return ()
+    first = _of_axle(tandem.first)
+    footprints = (_of_axle(one.axle, "single") for one in tandem.front_axles)
+    return tuple(one._replace(offset_m=one.offset_m - first.offset_m) for one in footprints)
 
 
-def lead_of(vehicle: Vehicle) -> Lead:
-    """Return the axle ahead of a tandem, `NO_LEAD` for a truck of two axles."""
+def tandem_truck_of(vehicle: Vehicle) -> TandemTruck:
+    """Return the truck with a tandem as the method knows it; `NO_TANDEM` for one of two axles."""
     tandem = vehicle.tandem
     if tandem is None:
-        return NO_LEAD
-    return Lead(
-        tandem.first.position_m,
+        return NO_TANDEM
+    first_m = tandem.first.position_m
+    axles = [one.axle for one in tandem.front_axles]
+    return TandemTruck(
+        first_m - tandem.front.position_m,
         vehicle.wheelbase_m,
-        tandem.lead.unsprung_mass_kg,
-        tandem.lead.tyre_stiffness_n_per_m,
-        tandem.lead.tyre_damping_ns_per_m,
-        tandem.lead.suspension_stiffness_n_per_m,
-        tandem.lead.suspension_damping_ns_per_m,
+        FrontAxles(
+            ahead_m=np.array([first_m - axle.position_m for axle in axles]),
+            share=np.array([one.share for one in tandem.front_axles]),
+            **{key: np.array([float(getattr(one, key)) for one in axles]) for key in _OF_FRONT},
+        ),
         tandem.is_equalised,
     )
 
 
-def displaced_leads_of(vehicle: Vehicle) -> tuple[Lead, ...]:
-    """Return the axle ahead of a tandem with mass, tyre and tyre damping displaced one by one.
+def displaced_trucks_of(vehicle: Vehicle) -> tuple[TandemTruck, ...]:
+    """Return the truck with one value of an axle ahead of a tandem displaced, one by one.
 
-    Each is displaced by the standard deviation of its prior. There are none without a tandem.
+    Values are mass, tyre and tyre damping of each axle, and its springs if there are several; each
+    is displaced by the standard deviation of its prior. There are none without a tandem.
     """
-    tandem, lead = vehicle.tandem, lead_of(vehicle)
+    tandem, truck = vehicle.tandem, tandem_truck_of(vehicle)
     if tandem is None:
         return ()
-
-    def displaced(key: str) -> float:
-        nominal = float(getattr(tandem.lead, key))
-        return nominal * (1.0 + vehicle.spread(key)) if nominal else vehicle.scale_at_zero(key)
-
-    return (
-        lead._replace(unsprung_mass_kg=displaced("unsprung_mass_kg")),
-        lead._replace(tyre_stiffness_n_per_m=displaced("tyre_stiffness_n_per_m")),
-        lead._replace(tyre_damping_ns_per_m=displaced("tyre_damping_ns_per_m")),
-    )
+    displaced = []
+    for number, one in enumerate(tandem.front_axles):
+        for key in _OF_FRONT if len(tandem.front_axles) > 1 else _OF_FRONT[:3]:
+            nominal = float(getattr(one.axle, key))
+            if not nominal and key == "suspension_damping_ns_per_m":
+                continue  # a spring without a damper
+            values = getattr(truck.front, key).copy()
+            values[number] = (
+                nominal * (1.0 + vehicle.spread(key)) if nominal else vehicle.scale_at_zero(key)
+            )
+            displaced.append(truck._replace(front=truck.front._replace(**{key: values})))
+    return tuple(displaced)
 
 
 def _of_axle(axle: Axle, usually: str = "twin") -> Footprint:

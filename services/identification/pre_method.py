@@ -32,10 +32,10 @@ from services.finding.placed import first_axle
 from services.identification.checks import stiffer_elements, undeclared_axles
 from services.identification.fit_reasons import contradictions, reasons_of_fit
 from services.identification.footprints import (
-    displaced_leads_of,
+    displaced_trucks_of,
     footprints_of,
-    lead_footprint_of,
-    lead_of,
+    front_footprints_of,
+    tandem_truck_of,
 )
 from services.identification.fusing import stored
 from services.identification.lane import lane_factor
@@ -105,14 +105,15 @@ def inputs_of(
     assert data.samples is not None  # noqa: S101 - it was checked before
     step_s = 1.0 / data.samples.rate_hz
     stop_s = start_s + step_s * (acceleration.shape[1] - 1)
-    lead = lead_of(vehicle)
+    truck = tandem_truck_of(vehicle)
+    antenna_m = vehicle.gps_antenna_to_front_axle_m - truck.front.ahead_m.max(initial=0.0)
     time_s = data.fixes.time_s - receiver.latency_s
     near = (time_s > start_s - 1.0) & (time_s < stop_s + 1.0)
     direction = data.stay.direction
     speed = np.abs(data.fixes.speed_m_per_s[near])
     fixes = posterior.ChainageFixes(
         time_s[near],
-        data.chainage_m[near] + direction * (vehicle.gps_antenna_to_front_axle_m - lead.ahead_m),
+        data.chainage_m[near] + direction * antenna_m,
         direction * speed,
         max(receiver.position_noise_m, 0.01),
         max(receiver.speed_noise_m_per_s, 0.003),
@@ -145,9 +146,9 @@ def inputs_of(
         footprints_of(vehicle),
         bridge.torsional_wave_speed_m_per_s,
         lane_factor(data),
-        lead,
-        lead_footprint_of(vehicle),
-        displaced_leads_of(vehicle),
+        truck,
+        front_footprints_of(vehicle),
+        displaced_trucks_of(vehicle),
     )
 
 
@@ -309,7 +310,7 @@ def _values(
         names[i]: summary_of(parameters.unit(names[i]), theta[:, i], _prior(problem, int(i)))
         for i in kept
     }
-    behind_kg = data.vehicle.total_mass_kg - problem.crossing.lead.unsprung_mass_kg
+    behind_kg = data.vehicle.total_mass_kg - problem.crossing.tandem.front.unsprung_mass_kg.sum()
     masses = body_masses(at.theta, behind_kg, data.vehicle.wheelbase_m)
     for k, name in enumerate(("m_s", "m_s1", "m_s2")):
         values[name] = summary_of("kg", masses[:, k] * scale, None)

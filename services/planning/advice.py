@@ -63,7 +63,8 @@ def mismatch_in_words(found: SurveyForecast) -> str:
     offset_mm = 1e3 * abs(rear.offset_m - front.offset_m)
     if vehicle.tandem is not None:
         given = "" if has_declared_offset(vehicle) else " (assumed, lateral_offset_m)"
-        which = "offset of axle 3 from 2"
+        first = vehicle.tandem.number
+        which = f"offset of axle {first + 1} from {first}"
     else:
         given = "" if has_declared_offset(vehicle) else " (assumed, rear_axle_offset_m)"
         which = "rear axle offset"

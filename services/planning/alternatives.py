@@ -20,7 +20,7 @@ _LIGHTER, _HEAVIER = 0.4, 1.5
 """Loads of an emptied and of a loaded truck, relative to the planned load on its springs."""
 _LEAST_HEAVIER = 1.1
 """Least relative load of a loaded truck that is worth a row."""
-_LEGAL_TOTAL_KG: Final = {2: 18_000.0, 3: 26_000.0}
+_LEGAL_TOTAL_KG: Final = {2: 18_000.0, 3: 26_000.0, 4: 32_000.0}
 """Largest total mass in international traffic by number of axles (Directive 96/53/EC, Annex I)."""
 _LEGAL_AXLE_KG: Final = 11_500.0
 """Largest load of a driving axle there."""
@@ -152,7 +152,7 @@ def with_tyres(site: Site, behind: str) -> Site:
             )
             for axle in vehicle.tandem.axles
         )
-        axles = (vehicle.tandem.lead, *changed_axles)
+        axles = (*vehicle.axles[:-2], *changed_axles)
         return _with_vehicle(site, vehicle.model_copy(update={"axles": axles}))
     width = (vehicle.tyre_width_m or (0.25, 0.25))[0]
     twin = behind == "twin"
@@ -210,7 +210,7 @@ def _carrying(vehicle: Vehicle, factor: float) -> Vehicle:
 
 def _heavier(vehicle: Vehicle) -> Iterator[float]:
     """Yield the relative load of a loaded truck within legal limits, unless it is hardly more."""
-    legal = _LEGAL_TOTAL_KG[2 if vehicle.tandem is None else 3]
+    legal = _LEGAL_TOTAL_KG[min(max(len(vehicle.axles), 2), max(_LEGAL_TOTAL_KG))]
     factors = [_HEAVIER, (legal - sum(vehicle.unsprung_mass_kg)) / vehicle.sprung_mass_kg]
     if vehicle.tandem is None:
         factors += [

@@ -184,10 +184,10 @@ def _with_damped_tyres(site: Site) -> Site:
     """
     vehicle = site.vehicles[0]
     damping = _MEDIAN_OF_HALF_NORMAL * vehicle.scale_at_zero("tyre_damping_ns_per_m")
-    lead, *behind = vehicle.axles
+    ahead = vehicle.axles[:-2]
     damped = [
         axle.model_copy(update={"tyre_damping_ns_per_m": axle.tyre_damping_ns_per_m or damping})
-        for axle in behind
+        for axle in vehicle.axles[len(ahead) :]
     ]
-    changed = vehicle.model_copy(update={"axles": (lead, *damped)})
+    changed = vehicle.model_copy(update={"axles": (*ahead, *damped)})
     return site.model_copy(update={"vehicles": (changed,)})

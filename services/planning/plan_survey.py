@@ -37,8 +37,8 @@ def plan_survey(given: Site, wishes: SurveyWishes, report: Steps) -> SurveyForec
     vehicle = site.vehicles[0]
     if vehicle.tandem is not None and not vehicle.tandem.is_equalised:
         raise InputError(
-            f"{vehicle.id}: its axles 2 and 3 have springs of their own, whose friction is unknown "
-            "before a drive; a survey is planned for an equalised tandem or for two axles"
+            f"{vehicle.id}: the axles of its tandem have springs of their own, whose friction is "
+            "unknown before a drive; a survey is planned for an equalised tandem or for two axles"
         )
     if wishes.tyres is not None:
         site = with_tyres(site, wishes.tyres)

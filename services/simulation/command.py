@@ -35,7 +35,7 @@ from services.simulation.pavement import Pavement
 from services.simulation.recorded_road import SURVEY_ROAD_M
 from services.simulation.schedule import Schedule, schedule_of
 from services.simulation.settings import SimulateOptions
-from services.simulation.usual_trucks import usual_tandem
+from services.simulation.usual_trucks import usual_four_axles, usual_tandem
 from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
 _OF_PAVEMENT: Final = ("deck_roughness", "joints", "anisotropy")
 _OF_SURFACE: Final = ("tyres", "rear_offset", "wander", *_OF_PAVEMENT)
+_TIPPERS: Final = {3: usual_tandem, 4: usual_four_axles}
 _NOT_OF_TANDEM: Final = (
     "bearing_stiffness", "departed_vehicle", "bilinear", "air_springs", *_OF_PAVEMENT,
 )  # fmt: skip
@@ -138,17 +139,19 @@ def _with_tandem(asked: SimulateOptions, site: Site) -> Site | None:
     """Return the site whose truck has a tandem, by itself or by `--axles`; None for two axles."""
     truck = site.vehicles[0]
     if truck.tandem is not None:
-        if asked.axles == 2:
-            raise InputError(f"--axles: is 2, but {truck.id} has 3 axles")
+        if asked.axles not in (None, len(truck.axles)):
+            raise InputError(
+                f"--axles: is {asked.axles}, but {truck.id} has {len(truck.axles)} axles"
+            )
         if asked.tyres:
             raise InputError(
                 "--tyres: the site file declares the tyres of each axle, leave the option out"
             )
         return site
-    if asked.axles != 3:
+    if asked.axles not in _TIPPERS:
         return None
     noise = noise_density_of(None if asked.site is None else site, asked.noise)
-    tipper = usual_tandem(max(densities_of(noise)), asked.tyres or "twin")
+    tipper = _TIPPERS[asked.axles](max(densities_of(noise)), asked.tyres or "twin")
     rate = max(site.sensor.rate_hz)
     sensors = tuple(one.model_copy(update={"rate_hz": rate}) for one in tipper.sensors)
     tipper = tipper.model_copy(update={"sensors": sensors})

@@ -67,7 +67,7 @@ def drawn_tandem(
     vehicle, how = site.vehicles[0], truth.conditions
     if vehicle.tandem is None or not vehicle.tandem.is_equalised:
         raise InputError(
-            f"{vehicle.id}: its axles 2 and 3 have springs of their own, only an equalised "
+            f"{vehicle.id}: the axles of its tandem have springs of their own, only an equalised "
             "tandem is simulated"
         )
     rng = np.random.default_rng(np.random.SeedSequence([seed, 0x7A2F]))
@@ -84,11 +84,12 @@ def drawn_tandem(
     )
     case = tandem_case(site, beam.flexural_rigidity_nm2 / nominal, drive)
     truck = truck_with_tandem(drawn_vehicle(vehicle, truck_seed), drive)
-    behind = [axle._replace(outer_share=effects.outer_share) for axle in truck.axles[1:]]
+    ahead = len(vehicle.tandem.front_axles)
+    behind = [axle._replace(outer_share=effects.outer_share) for axle in truck.axles[ahead:]]
     receiver = site.receiver
     case = case._replace(
         seed=seed,
-        truck=truck._replace(axles=(truck.axles[0], *behind)),
+        truck=truck._replace(axles=(*truck.axles[:ahead], *behind)),
         deck=case.deck._replace(
             mass_per_length_kg_per_m=float(beam.mass_per_length_kg_per_m[0]),
             rayleigh_alpha_per_s=beam.rayleigh_alpha_per_s,
@@ -139,10 +140,11 @@ def drawn_vehicle(vehicle: Vehicle, seed: int) -> Vehicle:
     def factor(spread: float) -> float:
         return float(np.exp(spread * rng.standard_normal()))
 
+    number = tandem.number
     gap_m = tandem.gap_m * factor(vehicle.spread("wheelbase_m"))
     share = min(tandem.share * factor(vehicle.tandem_share_spread), 0.95)
     axles = []
-    for number, axle in enumerate(vehicle.axles):
+    for place, axle in enumerate(vehicle.axles):
         of_axle = {
             key: getattr(axle, key) * factor(vehicle.spread(key))
             for key in (
@@ -156,19 +158,25 @@ def drawn_vehicle(vehicle: Vehicle, seed: int) -> Vehicle:
         if axle.tyre_damping_ns_per_m == 0.0:
             scale = vehicle.scale_at_zero("tyre_damping_ns_per_m")
             of_axle["tyre_damping_ns_per_m"] = scale * abs(float(rng.standard_normal()))
-        if number == 2:
+        if place == number:
             of_axle["position_m"] = tandem.first.position_m + gap_m
         axles.append(axle.model_copy(update=of_axle))
-    bogie = vehicle.bogies[0].model_copy(update={"axles": (2, 3), "shares": (share, 1.0 - share)})
-    drawn = vehicle.model_copy(update={"axles": tuple(axles), "bogies": (bogie,)})
+    bogies = tuple(
+        bogie.model_copy(
+            update={"axles": (number, number + 1), "shares": (share, 1.0 - share)}
+            if number in bogie.axles
+            else {}
+        )
+        for bogie in vehicle.bogies
+    )
+    drawn = vehicle.model_copy(update={"axles": tuple(axles), "bogies": bogies})
     of_drawn = drawn.tandem
     assert of_drawn is not None  # noqa: S101 - it has the same axles
-    unsprung = [axle.unsprung_mass_kg for axle in axles]
     return drawn.model_copy(
         update={
             "total_mass_kg": vehicle.total_mass_kg * factor(vehicle.spread("total_mass_kg")),
-            "unsprung_mass_kg": (unsprung[0], unsprung[1] + unsprung[2]),
-            "wheelbase_m": of_drawn.force_m,
+            "unsprung_mass_kg": (of_drawn.front.unsprung_mass_kg, of_drawn.rear.unsprung_mass_kg),
+            "wheelbase_m": of_drawn.rear.position_m - of_drawn.front.position_m,
             "front_axle_to_cg_m": vehicle.front_axle_to_cg_m
             * factor(vehicle.spread("front_axle_to_cg_m")),
             "pitch_inertia_ratio": vehicle.pitch_inertia_ratio

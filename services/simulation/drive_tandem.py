@@ -174,18 +174,18 @@ def _tables(site: Site) -> dict[str, dict[str, Any]]:
 def truck_with_tandem(vehicle: Vehicle, how: TandemDrive) -> WideTruck:
     """Return the site's nominal truck with two sides; raise ValueError for one without a tandem.
 
-    Springs that do not share their load carry it in proportion to their stiffness.
+    Springs that do not share their load carry what the site file declares of each axle.
     """
     tandem = vehicle.tandem
     if tandem is None:
         raise ValueError("the truck has two axles")
     d_1, lever = vehicle.front_axle_to_cg_m, vehicle.wheelbase_m
     behind = vehicle.sprung_mass_kg * d_1 / lever
-    carried = (
-        vehicle.sprung_mass_kg - behind,
+    carried = [
+        *(one.share * (vehicle.sprung_mass_kg - behind) for one in tandem.front_axles),
         tandem.share * behind,
         (1.0 - tandem.share) * behind,
-    )
+    ]
     prints = footprints_of(vehicle)
     offset = prints[1].offset_m or (0.0 if how.surface is None else REAR_OFFSET_M)
     if how.surface is not None and how.surface.rear_offset_m is not None:
@@ -199,27 +199,32 @@ def truck_with_tandem(vehicle: Vehicle, how: TandemDrive) -> WideTruck:
         }
         for one in prints
     ]
-    front = {"track_m": tandem.lead.track_m or _FRONT_TRACK_M, "spring_track_m": 0.84}
-    offsets = (0.0, 0.0, offset)
+    ahead: list[dict[str, Any]] = [
+        {"track_m": one.axle.track_m or _FRONT_TRACK_M, "spring_track_m": 0.84}
+        for one in tandem.front_axles
+    ]
+    offsets = (*(0.0 for _ in ahead), 0.0, offset)
     axles = tuple(
-        _axle(axle, body_kg * how.friction_share, offset_m, shape)
+        _axle(axle, body_kg, how.friction_share, shape | {"offset_m": offset_m})
         for axle, body_kg, offset_m, shape in zip(
-            vehicle.axles, carried, offsets, (front, *own), strict=True
+            vehicle.axles, carried, offsets, (*ahead, *own), strict=True
         )
     )
     pitch = vehicle.pitch_inertia_ratio * vehicle.sprung_mass_kg * d_1 * (lever - d_1)
     body = Body(
         vehicle.sprung_mass_kg,
-        d_1,
+        tandem.front.position_m + d_1,
         pitch,
         vehicle.sprung_mass_kg * _ROLL_GYRATION_M**2,
         cg_height_m=vehicle.cg_height_m or 0.0,
     )
-    shared = (WideBogie((1, 2), (tandem.share, 1.0 - tandem.share)),)
+    first = len(ahead)
+    shared = (WideBogie((first, first + 1), (tandem.share, 1.0 - tandem.share)),)
     return WideTruck((body,), axles, shared if tandem.is_equalised else ())
 
 
-def _axle(axle: Axle, friction_kg: float, offset_m: float, shape: dict[str, Any]) -> WideAxle:
+def _axle(axle: Axle, body_kg: float, friction_share: float, shape: dict[str, Any]) -> WideAxle:
+    """Return an axle that carries `body_kg` of the body on a flat road."""
     return WideAxle(
         axle.position_m,
         axle.unsprung_mass_kg,
@@ -227,8 +232,8 @@ def _axle(axle: Axle, friction_kg: float, offset_m: float, shape: dict[str, Any]
         axle.suspension_damping_ns_per_m,
         axle.tyre_stiffness_n_per_m,
         axle.tyre_damping_ns_per_m,
-        friction_n=friction_kg * STANDARD_GRAVITY_M_PER_S2,
-        offset_m=offset_m,
+        friction_n=friction_share * body_kg * STANDARD_GRAVITY_M_PER_S2,
+        preload_n=body_kg * STANDARD_GRAVITY_M_PER_S2,
         **shape,
     )
 

@@ -66,10 +66,10 @@ class SimulateOptions:
         "identifier of the bridge to cross (default: the site's first)", metavar="ID"
     )
     axles: int | None = opt(
-        "number of axles of the truck; 3: a loaded tipper with an equalised tandem, unless the "
-        "site's truck has one (default: the site's truck, or 2)",
+        "number of axles of the truck; 3 or 4: a loaded tipper with an equalised tandem, unless "
+        "the site's truck has one (default: the site's truck, or 2)",
         int,
-        choices=(2, 3),
+        choices=(2, 3, 4),
     )
     road: str | None = opt(
         "road class by ISO 8608 (default: the site's road_class, or A)", choices=tuple("ABCDE")

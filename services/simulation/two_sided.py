@@ -56,6 +56,8 @@ class WideAxle(NamedTuple):
     friction_n: float = 0.0
     friction_length_m: float = 0.002
     body: int = 0
+    preload_n: float = 0.0
+    """Force of its springs where those without one are relaxed, as their shape or a shim sets."""
 
     @property
     def roll_inertia_kg_m2(self) -> float:
@@ -155,7 +157,7 @@ def tyres_of(truck: WideTruck) -> WideTyres:
 def static_axle_loads_n(truck: WideTruck) -> Floats:
     """Return the load of each axle (n,) on a flat road, wheels included.
 
-    Redundant springs share the load as if their relaxed lengths were equal.
+    Redundant springs share what their preloads leave as if their relaxed lengths were equal.
     """
     gravity = STANDARD_GRAVITY_M_PER_S2
     loads = np.array([gravity * axle.mass_kg for axle in truck.axles])
@@ -175,7 +177,12 @@ def static_axle_loads_n(truck: WideTruck) -> Floats:
             stiffness.append(_KINGPIN_N_PER_M)
         rows = np.stack([np.ones(len(places)), np.array(places)])
         spread = np.array(stiffness) * rows
-        forces = spread.T @ np.linalg.solve(rows @ spread.T, np.array([weight, moment]))
+        preload = np.zeros(len(places))
+        preload[: len(groups)] = [
+            sum(truck.axles[i].preload_n for i in group.axles) for group in groups
+        ]
+        left = np.array([weight, moment]) - rows @ preload
+        forces = preload + spread.T @ np.linalg.solve(rows @ spread.T, left)
         if b == 1:
             kingpin_n = float(forces[-1])
         for group, force in zip(groups, forces, strict=False):

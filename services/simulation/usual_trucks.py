@@ -1,4 +1,4 @@
-"""Usual trucks, for forecasts and simulated surveys: a loaded tipper with a tandem, and a lorry.
+"""Usual trucks, for forecasts and simulated surveys: loaded tippers with a tandem, and a lorry.
 
 Values are those of ordinary trucks; a single truck differs from them.
 """
@@ -9,14 +9,21 @@ from schemas.site import Vehicle
 from schemas.site_axle_tables import TYRES
 
 TANDEM_KG: Final = 24_800.0
+FOUR_AXLES_KG: Final = 32_000.0
 LORRY_KG: Final = 16_300.0
-_PLACES_M: Final = (0.0, 4.60, 5.95)
-_LOADS_KG: Final = (7_800.0, 8_500.0, 8_500.0)
-_UNSPRUNG_KG: Final = (700.0, 1_050.0, 1_050.0)
-_SPRINGS_N_PER_M: Final = (3.4e5, 8.5e5, 8.5e5)
-_DAMPERS_NS_PER_M: Final = (24e3, 31e3, 31e3)
-_TYRES_N_PER_M: Final = (2.0e6, 3.7e6, 3.7e6)
-_TRACKS_M: Final = (2.05, 1.83, 1.83)
+_FRONT: Final[dict[str, Any]] = {
+    "unsprung_mass_kg": 700.0,
+    "suspension_stiffness_n_per_m": 3.4e5,
+    "suspension_damping_ns_per_m": 24e3,
+    "tyre_stiffness_n_per_m": 2.0e6,
+}
+_BEHIND: Final[dict[str, Any]] = {
+    "unsprung_mass_kg": 1_050.0,
+    "suspension_stiffness_n_per_m": 8.5e5,
+    "suspension_damping_ns_per_m": 31e3,
+    "tyre_stiffness_n_per_m": 3.7e6,
+}
+_TRACKS_M: Final = (2.05, 1.83)
 
 
 def usual_tandem(noise_ug_per_rthz: float, tyres: str = "twin") -> Vehicle:
@@ -25,37 +32,62 @@ def usual_tandem(noise_ug_per_rthz: float, tyres: str = "twin") -> Vehicle:
     Four sensors are in the middle: on the body above the front axle and above the tandem, and on
     both axles of the tandem.
     """
-    axles = []
-    for i, place in enumerate(_PLACES_M):
-        kind = "single" if i == 0 else tyres
+    places, loads = ((0.0,), (4.60, 5.95)), ((7_800.0,), (8_500.0, 8_500.0))
+    return _tipper("tandem", TANDEM_KG, places, loads, noise_ug_per_rthz, tyres)
+
+
+def usual_four_axles(noise_ug_per_rthz: float, tyres: str = "twin") -> Vehicle:
+    """Return a four-axle tipper of `FOUR_AXLES_KG`, with two steered axles and a tandem.
+
+    Sensors and `tyres` are as in `usual_tandem`; the steered axles have springs of their own.
+    """
+    places, loads = ((0.0, 1.95), (5.10, 6.45)), ((6_800.0, 6_800.0), (9_200.0, 9_200.0))
+    return _tipper("four-axles", FOUR_AXLES_KG, places, loads, noise_ug_per_rthz, tyres)
+
+
+def _tipper(
+    identifier: str,
+    total_mass_kg: float,
+    places_m: tuple[tuple[float, ...], tuple[float, ...]],
+    loads_kg: tuple[tuple[float, ...], tuple[float, ...]],
+    noise_ug_per_rthz: float,
+    tyres: str,
+) -> Vehicle:
+    """Return a tipper with axles at these places, ahead of the tandem and in it."""
+    axles: list[dict[str, Any]] = []
+    for behind, values in enumerate((_FRONT, _BEHIND)):
+        kind = tyres if behind else "single"
         of = TYRES[kind]
-        axles.append(
-            {
-                "position_m": place,
-                "tyres": kind,
-                "tyre_width_m": of.width_m,
-                "twin_tyre_distance_m": of.twin_distance_m,
-                "track_m": _TRACKS_M[i] if tyres == "twin" else _TRACKS_M[0],
-                "load_kg": _LOADS_KG[i],
-                "unsprung_mass_kg": _UNSPRUNG_KG[i],
-                "suspension_stiffness_n_per_m": _SPRINGS_N_PER_M[i],
-                "suspension_damping_ns_per_m": _DAMPERS_NS_PER_M[i],
-                "tyre_stiffness_n_per_m": _TYRES_N_PER_M[i],
-            }
-        )
-    middle_m = 0.5 * (_PLACES_M[1] + _PLACES_M[2])
+        for place, load in zip(places_m[behind], loads_kg[behind], strict=True):
+            axles.append(
+                {
+                    "position_m": place,
+                    "tyres": kind,
+                    "tyre_width_m": of.width_m,
+                    "twin_tyre_distance_m": of.twin_distance_m,
+                    "track_m": _TRACKS_M[behind] if tyres == "twin" else _TRACKS_M[0],
+                    "load_kg": load,
+                    **values,
+                }
+            )
+    ahead, (first, second) = len(places_m[0]), places_m[1]
+    number = ahead + 1
+    bogies: list[dict[str, Any]] = [{"axles": [number, number + 1], "equalised": True}]
+    front_m = sum(places_m[0]) / ahead
     table: dict[str, Any] = {
-        "id": "tandem",
-        "total_mass_kg": TANDEM_KG,
+        "id": identifier,
+        "total_mass_kg": total_mass_kg,
         "gps_antenna_to_front_axle_m": 0.0,
         "cg_height_m": 1.3,
         "axles": axles,
-        "bogies": [{"axles": [2, 3], "equalised": True}],
+        "bogies": bogies,
         "sensors": [
-            _sensor("sprung_front", noise_ug_per_rthz, on="body", position_m=0.0),
-            _sensor("sprung_rear", noise_ug_per_rthz, on="body", position_m=middle_m),
-            _sensor("unsprung_2", noise_ug_per_rthz, on="axle", axle=2),
-            _sensor("unsprung_3", noise_ug_per_rthz, on="axle", axle=3),
+            _sensor("sprung_front", noise_ug_per_rthz, on="body", position_m=front_m),
+            _sensor("sprung_rear", noise_ug_per_rthz, on="body", position_m=0.5 * (first + second)),
+            *(
+                _sensor(f"unsprung_{axle}", noise_ug_per_rthz, on="axle", axle=axle)
+                for axle in (number, number + 1)
+            ),
         ],
     }
     return Vehicle.model_validate(table)
@@ -67,7 +99,7 @@ def usual_lorry(tyres: str = "twin") -> Vehicle:
     With single tyres both axles have the same tyres and one track. Four sensors are in the middle.
     """
     kinds = (TYRES["single"], TYRES[tyres])
-    front, behind, _ = _TYRES_N_PER_M
+    front, behind = (of["tyre_stiffness_n_per_m"] for of in (_FRONT, _BEHIND))
     if tyres == "single":  # twin tyres are two a side, a single axle has the front one's two tyres
         behind = front
     return Vehicle.model_validate(

@@ -30,9 +30,11 @@ KINDS: Final = {
     "own-springs": _LOADED._replace(equalised=False, friction_share=0.0),
     "own-rubbing": _LOADED._replace(equalised=False, friction_share=0.08),
     "undeclared": _LOADED._replace(equalised=False, friction_share=0.08, is_declared=False),
+    "four-axles": _LOADED._replace(has_two_steered=True),
 }
 """Kinds of crossings: a tandem 20 mm aside, twin tyres loaded 55:45, axles on springs of their own
-without and with friction, and such axles that the owner declares as equalised."""
+without and with friction, such axles that the owner declares as equalised, and two steered axles
+ahead of an equalised tandem."""
 CONSOLE: Final = Console(soft_wrap=True)
 
 

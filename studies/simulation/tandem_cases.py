@@ -1,4 +1,4 @@
-"""Drawn crossings of trucks with a tandem behind the front axle, equalised or on its own springs.
+"""Drawn crossings of trucks with a tandem behind front axles, equalised or on its own springs.
 
 The owner knows the axles' places and the total mass, weighs each axle, and has all other values
 within SITE_ERROR, as in `wide_cases`.
@@ -31,6 +31,10 @@ SHARE: Final = (0.47, 0.53)
 FRICTION_SHARE: Final = (0.02, 0.1)
 OFFSET_M: Final = 0.005
 """Lateral offset of the tandem's second axle from the first."""
+STEERED_APART_M: Final = (1.8, 2.1)
+"""Distance of two steered axles."""
+_LONGER_M: Final = 0.7
+"""Distance by which a truck with two steered axles is longer."""
 _LOAD_ERROR: Final = 0.01
 
 
@@ -52,6 +56,8 @@ class TandemOptions(NamedTuple):
     span_m: tuple[float, float] = SPAN_M
     is_declared: bool = True
     """Whether the site file states how the axles share their load; otherwise it is `equalised`."""
+    has_two_steered: bool = False
+    """Whether there are two steered axles, with as much more mass; they have their own springs."""
 
 
 USUAL: Final = TandemOptions()
@@ -62,6 +68,9 @@ def draw_tandem(seed: int, options: TandemOptions = USUAL) -> WideCase:
     rng = np.random.default_rng(np.random.SeedSequence([seed, 0x7A2D]))
     u = rng.uniform
     truck = tandem_truck_of(rng, options)
+    if options.has_two_steered:
+        apart = np.random.default_rng(np.random.SeedSequence([seed, 0x7A31]))
+        truck = with_second_steered_axle(truck, apart)
     plain, ratios = draw_beam(rng, options.span_m, fewest_below_m=26.0, weak_share=0.7)
     rigidity = plain.flexural_rigidity_nm2[0]
     deck = plain._replace(flexural_rigidity_nm2=tuple((rigidity * ratios).tolist()))
@@ -146,14 +155,50 @@ def tandem_truck_of(rng: np.random.Generator, options: TandemOptions) -> WideTru
     return WideTruck((body,), tuple(axles), bogies)
 
 
+def with_second_steered_axle(truck: WideTruck, rng: np.random.Generator) -> WideTruck:
+    """Return a truck with an equalised tandem, longer and heavier by a second steered axle."""
+    u, g = rng.uniform, STANDARD_GRAVITY_M_PER_S2
+    first, *tandem = truck.axles
+    carried = static_axle_loads_n(truck) - g * np.array([axle.mass_kg for axle in truck.axles])
+    vary = np.exp(0.1 * rng.standard_normal(4))
+    second = first._replace(
+        position_m=float(u(*STEERED_APART_M)),
+        mass_kg=first.mass_kg * float(vary[0]),
+        suspension_stiffness_n_per_m=first.suspension_stiffness_n_per_m * float(vary[1]),
+        suspension_damping_ns_per_m=first.suspension_damping_ns_per_m * float(vary[2]),
+        tyre_stiffness_n_per_m=first.tyre_stiffness_n_per_m * float(vary[3]),
+    )
+    behind = [axle._replace(position_m=axle.position_m + _LONGER_M) for axle in tandem]
+    loads = [carried[0], carried[0] * float(u(0.95, 1.05)), *carried[1:]]
+    axles = tuple(
+        axle._replace(preload_n=float(load))
+        for axle, load in zip((first, second, *behind), loads, strict=True)
+    )
+    body_kg = sum(loads) / g
+    places = [axle.position_m for axle in axles]
+    cg = float(np.dot(places, loads) / sum(loads))
+    front_m = places[1] * loads[1] / (loads[0] + loads[1])
+    force_m = float(np.dot(places[2:], loads[2:]) / sum(loads[2:]))
+    pitch = (cg - front_m) * (force_m - cg) * float(u(0.85, 1.15))
+    bogie = truck.bogies[0]._replace(axles=(2, 3))
+    return WideTruck((rigid_body(float(body_kg), cg, pitch),), axles, (bogie,))
+
+
 def tandem_sensors(truck: WideTruck, noise_ug: float) -> tuple[WideSensor, ...]:
-    """Return two sensors on the body, above the front axle and the tandem, and two on its axles."""
-    middle = 0.5 * (truck.axles[1].position_m + truck.axles[2].position_m)
+    """Return two sensors on the body, above front axles and tandem, and two on the tandem's axles.
+
+    The front one is in the middle of the front axles.
+    """
+    *ahead, first, second = (axle.position_m for axle in truck.axles)
+    front, middle = sum(ahead) / len(ahead), 0.5 * (first + second)
+    number = len(truck.axles) - 1
     return (
-        WideSensor("sprung_front", "body", 0.0, noise_ug_per_rthz=noise_ug),
+        WideSensor("sprung_front", "body", round(front, 3), noise_ug_per_rthz=noise_ug),
         WideSensor("sprung_rear", "body", round(middle, 3), noise_ug_per_rthz=noise_ug),
-        WideSensor("unsprung_2", "axle", axle=2, noise_ug_per_rthz=noise_ug),
-        WideSensor("unsprung_3", "axle", axle=3, noise_ug_per_rthz=noise_ug),
+        *(
+            WideSensor(f"unsprung_{axle}", "axle", axle=axle, noise_ug_per_rthz=noise_ug)
+            for axle in (number, number + 1)
+        ),
     )
 
 
@@ -164,7 +209,7 @@ def declared_tandem(
     *,
     equalised: bool = True,
 ) -> dict[str, Any]:
-    """Return the vehicle's table, with a bogie of axles 2 and 3, as its owner would write it."""
+    """Return the vehicle's table, with a bogie of the last two axles, as its owner writes it."""
     weighed = static_axle_loads_n(truck) / STANDARD_GRAVITY_M_PER_S2
     axles = [
         {
@@ -197,6 +242,6 @@ def declared_tandem(
         "cg_height_m": 1.3,
         "total_mass_kg": round(truck.total_mass_kg, 1),
         "axles": axles,
-        "bogies": [{"axles": [2, 3], "equalised": equalised}],
+        "bogies": [{"axles": [len(axles) - 1, len(axles)], "equalised": equalised}],
         "sensors": placed,
     }

@@ -19,7 +19,7 @@ from pre_core.crossing import (
 )
 from pre_core.crossing.fit import Optimum
 from pre_core.crossing.misfit import OffBridgeFit
-from pre_core.physics.tandem import NO_LEAD
+from pre_core.physics.tandem import NO_TANDEM
 from pre_core.search.loop import Termination
 
 BUDGET = optimum._Budget(evaluations=1000, chi2=fit.WORTH_COMPLETING_CHI2)
@@ -41,7 +41,7 @@ def found(chi2: float, evaluations: int, ending: Termination = Termination.CONVE
         y=np.zeros(1),
         lines_hz=(),
         force=np.zeros(1),
-        crossing=SimpleNamespace(lead=NO_LEAD),
+        crossing=SimpleNamespace(tandem=NO_TANDEM),
         mismatch=SimpleNamespace(level_m3=np.zeros(1)),
     )
     return Optimum(unknown, unknown, ending, chi2, evaluations, 1)
@@ -380,7 +380,7 @@ def test_without_a_fit_the_best_poor_start_is_completed(
         optimum, "_other_strategies", lambda _: ((), OffBridgeFit(np.zeros(1), np.inf, 0))
     )
     monkeypatch.setattr(optimum, "_try_strategies", lambda *_: [second])
-    problem: Any = SimpleNamespace(crossing=SimpleNamespace(lead=NO_LEAD))
+    problem: Any = SimpleNamespace(crossing=SimpleNamespace(tandem=NO_TANDEM))
     ended = optimum._run_strategies(problem, np.zeros(1), lambda *_: None, 1000)
     assert len(ended) == 2
     assert min(one.chi2_per_dof for one in ended) == ends_at
@@ -509,7 +509,7 @@ def test_other_bridges_are_tried_where_only_the_bridge_is_not_explained(
     monkeypatch.setattr(optimum, "_refine_candidates", lambda *_: one)
     monkeypatch.setattr(optimum, "_other_strategies", lambda _: ((), alone))
     monkeypatch.setattr(optimum, "_try_strategies", lambda *_: [])
-    problem: Any = SimpleNamespace(crossing=SimpleNamespace(lead=NO_LEAD))
+    problem: Any = SimpleNamespace(crossing=SimpleNamespace(tandem=NO_TANDEM))
     ended = optimum._run_strategies(problem, np.zeros(1), lambda *_: None, 1000)
     assert [other.chi2_per_dof for other in ended] == [chi2, *ends_at]
     is_tried = off_bridge < min(chi2, 1.49) and chi2 < 50.0
@@ -561,7 +561,7 @@ def refined(
 ) -> Optimum:
     """Refine four offsets whose fits are these candidates."""
     problem: Any = SimpleNamespace(
-        mismatch=SimpleNamespace(level_m3=np.zeros(1)), force=np.array([force]), front_axle=None
+        mismatch=SimpleNamespace(level_m3=np.zeros(1)), force=np.array([force]), front_axles=()
     )
     problem._replace = lambda **_: problem
     places = [walk.Placement(0.0, float(n), np.zeros(1), np.zeros(1, int)) for n in range(4)]
@@ -579,7 +579,7 @@ def refined(
 
 
 class _Problem(NamedTuple):
-    front_axle: object
+    front_axles: object
     force: NDArray[np.float64]
 
 
@@ -590,15 +590,15 @@ def test_offsets_are_scanned_as_if_the_front_axle_were_known(
     seen: list[object] = []
 
     def find_truck(problem: Any, y: Any, *_: Any) -> tuple[Any, Any, int]:
-        seen.append(problem.front_axle)
+        seen.append(problem.front_axles)
         return problem, y, 0
 
     def scan(problem: Any, y: Any, *_: Any) -> tuple[list[walk.Placement], int]:
-        seen.append(problem.front_axle)
+        seen.append(problem.front_axles)
         return [walk.Placement(0.0, 0.0, np.zeros(1), np.zeros(1, int))], 0
 
     def fit_there(problem: Any, *_: Any) -> tuple[None, int]:
-        seen.append(problem.front_axle)
+        seen.append(problem.front_axles)
         return None, 0
 
     monkeypatch.setattr(optimum, "_find_truck", find_truck)
@@ -609,7 +609,7 @@ def test_offsets_are_scanned_as_if_the_front_axle_were_known(
     monkeypatch.setattr(optimum, "fit_all", fit_there)
     monkeypatch.setattr(optimum, "_no_optimum", lambda *_, **__: found(0.0, 1))
     optimum._refine_likeliest(problem, np.zeros(1), STRATEGY, lambda *_: None, BUDGET)
-    assert seen == [None, None, "its spectra"]
+    assert seen == [(), (), "its spectra"]
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from schemas.site import Vehicle
 from schemas.site_file import faults_of_site, load_site, parse_site, site_hash, site_toml
 from schemas.vehicle_info import differences, vehicle_part
-from services.identification.footprints import footprints_of, lead_of
+from services.identification.footprints import footprints_of, tandem_truck_of
 from tests.unit.schemas import test_site
 
 TEXT = (Path(__file__).parents[2] / "data" / "csv_example" / "site.toml").read_text()
@@ -252,7 +252,7 @@ def test_both_spellings_are_refused_by_both_keys(key: str, value: str, other: st
         ),
         (
             (HEAD, FRONT, REAR, "[[vehicle.bogies]]\naxles = [1, 2]\n"),
-            "vehicle.bogies joins axles of a two-axle truck, it must join axles 2 and 3 of three",
+            "vehicle.bogies joins axles of a two-axle truck, it must join axles of three or",
         ),
         (
             (HEAD, "track_m = 'wide'\n", FRONT, REAR),
@@ -265,6 +265,7 @@ def test_what_is_wrong_with_axles_is_one_line(parts: tuple[str, ...], line: str)
 
 
 LAST = REAR.replace("= 5.0", "= 6.3").replace("10000", "9800").replace("1100", "1200")
+FOURTH = LAST.replace("= 6.3", "= 7.6")
 TANDEM_HEAD = HEAD.replace("16000", "25800")
 BOGIE = "[[vehicle.bogies]]\naxles = [2, 3]\nequalised = true\n"
 SENSORS = "".join(
@@ -303,6 +304,32 @@ def test_shares_move_the_force_of_a_tandem() -> None:
     assert again.tandem_share == pytest.approx(0.55)
 
 
+FOUR_HEAD = HEAD.replace("16000", "32000")
+SECOND = FRONT.replace("= 0.0", "= 1.9").replace("6000", "6200")
+ON_3_AND_4 = SENSORS.replace("axle = 3", "axle = 4").replace("axle = 2", "axle = 3")
+
+
+@pytest.mark.parametrize("ahead", ["", "[[vehicle.bogies]]\naxles = [1, 2]\n"])
+def test_two_steered_axles_are_one_at_their_common_force(ahead: str) -> None:
+    behind = BOGIE.replace("[2, 3]", "[3, 4]")
+    parts = (FOUR_HEAD, FRONT, SECOND, REAR, LAST, ahead, behind, ON_3_AND_4)
+    vehicle = vehicle_of(*parts)
+    tandem = vehicle.tandem
+    assert tandem is not None
+    assert (tandem.number, tandem.gap_m) == pytest.approx((3, 1.3))
+    front_m = 1.9 * 5600 / 11000
+    assert [one.share for one in tandem.front_axles] == pytest.approx([5400 / 11000, 5600 / 11000])
+    assert vehicle.front_force_m == pytest.approx(front_m)
+    assert vehicle.wheelbase_m == pytest.approx(5.65 - front_m)
+    assert vehicle.unsprung_mass_kg == (1200.0, 2300.0)
+    assert vehicle.front_axle_to_cg_m == pytest.approx((5.65 - front_m) * 17500 / 28500)
+    site = parse_site("".join(parts) + BEHIND, "a")
+    assert parse_site(site_toml(site), "b") == site
+    unknown = SECOND.replace("load_kg = 6200\n", "")
+    line = complaint(FOUR_HEAD, FRONT, unknown, REAR, LAST, behind, ON_3_AND_4)
+    assert line.startswith("vehicle.axles[1].load_kg is missing, it must be a mass in kg: two or")
+
+
 @pytest.mark.parametrize("bogie", ["", BOGIE.replace("true", "false")])
 def test_axles_on_springs_of_their_own_are_weighed(bogie: str) -> None:
     vehicle = vehicle_of(TANDEM_HEAD, FRONT, REAR, LAST, bogie, SENSORS)
@@ -312,7 +339,7 @@ def test_axles_on_springs_of_their_own_are_weighed(bogie: str) -> None:
     # Of 10.0 and 9.8 t 8.9 and 8.6 t are on the springs, each known to 2 % of the load.
     assert tandem.share == pytest.approx(8.9 / 17.5)
     assert tandem.share_spread == pytest.approx(8.6 / 17.5 * hypot(0.2 / 8.9, 0.196 / 8.6))
-    assert lead_of(vehicle).suspension_stiffness_n_per_m == 3.0e5
+    assert tandem_truck_of(vehicle).front.suspension_stiffness_n_per_m == [3.0e5]
     unknown = LAST.replace("load_kg = 9800\n", "")
     line = complaint(TANDEM_HEAD, FRONT, REAR, unknown, bogie, SENSORS)
     assert line.startswith("vehicle.axles[2].load_kg is missing, it must be a mass in kg")
@@ -340,13 +367,16 @@ def test_a_tandem_is_written_as_it_was_read(bogie: str) -> None:
         ),
         (
             (BOGIE + BOGIE, SENSORS),
-            "vehicle.bogies does not join axles 2 and 3, it must be one bogie of these",
+            "vehicle.bogies[1].axles are of a bogie already, remove one",
         ),
         (
             (BOGIE + "shares = [0.9, 0.1]\n", SENSORS),
             "vehicle.bogies[0].shares give one axle 90 % of the force, it must be at most 80 %",
         ),
-        ((BOGIE.replace("[2, 3]", "[1, 2]"), SENSORS), "vehicle.bogies does not join axles 2 and"),
+        (
+            (BOGIE.replace("[2, 3]", "[1, 2]"), SENSORS),
+            "vehicle.bogies[0].axles are 1 and 2, they must be the last two axles, 2 and 3",
+        ),
         ((BOGIE,), "vehicle.sensors is missing, it must place two accelerometers on the body"),
         (
             (BOGIE, SENSORS.replace("axle = 3", "axle = 1")),
@@ -356,7 +386,18 @@ def test_a_tandem_is_written_as_it_was_read(bogie: str) -> None:
             (BOGIE, SENSORS.replace("axle = 3", "axle = 4")),
             "vehicle.sensors[3].axle is 4, it must be the number of an axle, 1 to 3",
         ),
-        ((LAST.replace("= 6.3", "= 7.6"), BOGIE, SENSORS), "vehicle.axles has 4 axles, it must be"),
+        (
+            (FOURTH, BOGIE, SENSORS),
+            "vehicle.bogies[0].axles are 2 and 3, they must be the last two axles, 3 and 4",
+        ),
+        (
+            (FOURTH, BOGIE.replace("[2, 3]", "[1, 2]"), SENSORS),
+            "vehicle.bogies[0].equalised is true for axles 1 and 2, it must be false: only the",
+        ),
+        (
+            (FOURTH, BOGIE.replace("[2, 3]", "[2, 3, 4]"), SENSORS),
+            "vehicle.bogies[0].axles are 2 and 3 and 4, they must be the last two axles, 3 and 4",
+        ),
     ],
 )
 def test_other_trucks_of_many_axles_are_refused(parts: tuple[str, ...], line: str) -> None:
@@ -397,10 +438,10 @@ def _with_bogie(keys: str) -> str:
 @pytest.mark.parametrize(
     ("parts", "line"),
     [
-        (FRONT, "vehicle.axles has 1 entry, it must be two [[vehicle.axles]], or three: a front"),
+        (FRONT, "vehicle.axles has 1 entry, it must be two [[vehicle.axles]], or more with a"),
         (
             FRONT + "".join(REAR.replace("5.0", f"{5 + k}.0") for k in range(20)),
-            "vehicle.axles has 21 entries, it must be two [[vehicle.axles]], or three: a front",
+            "vehicle.axles has 21 entries, it must be two [[vehicle.axles]], or more with a",
         ),
         (
             FRONT + _with_bogie("axles = [2]"),

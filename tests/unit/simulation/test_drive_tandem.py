@@ -7,6 +7,7 @@ import pytest
 
 from schemas.errors import InputError
 from schemas.reasons import Reason
+from schemas.results import first_compared_axle
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.site_file import parse_site
@@ -18,7 +19,7 @@ from services.simulation.drawn import draw_truth, drive
 from services.simulation.drawn_tandem import TandemEffects, drawn_tandem, drawn_vehicle
 from services.simulation.drive_tandem import TandemDrive, tandem_case
 from services.simulation.two_sided import static_axle_loads_n
-from services.simulation.usual_trucks import usual_tandem
+from services.simulation.usual_trucks import usual_four_axles, usual_tandem
 from services.simulation.wheel_paths import SurfaceOptions
 from services.simulation.wide_crossings import drive_case, site_text
 from studies.simulation.tandem_cases import draw_tandem
@@ -57,6 +58,7 @@ def test_case_is_the_nominal_truck_of_the_site() -> None:
         (["--air-springs", "1.4"], "--air-springs: is not simulated for a truck with a tandem"),
         (["--speed", "9:11"], "--speed: is START:END, it must be one speed"),
         (["--axles", "2"], "--axles: is 2, but tandem-truck has 3 axles"),
+        (["--axles", "4"], "--axles: is 4, but tandem-truck has 3 axles"),
         (["--tyres", "twin"], "--tyres: the site file declares the tyres of each axle"),
     ],
 )
@@ -75,7 +77,7 @@ def test_survey_on_springs_of_their_own_is_refused_in_one_line(
     site_file.write_text(TEXT.replace("equalised = true", "equalised = false"))
     assert main(["survey", "--site", str(site_file), "--loss", "0.2"]) == 2
     error = capsys.readouterr().err
-    assert "tandem-truck: its axles 2 and 3 have springs of their own" in error
+    assert "tandem-truck: the axles of its tandem have springs of their own" in error
     assert error.count("\n") == 1
 
 
@@ -88,13 +90,49 @@ def test_three_axles_are_those_of_a_usual_tipper(tmp_path: Path) -> None:
     assert {one.noise_density_ug_per_rthz for one in site.vehicles[0].sensors} == {25.0}
 
 
-def test_springs_of_their_own_carry_the_load_by_their_stiffness() -> None:
+def test_two_steered_axles_are_simulated_and_identified(tmp_path: Path) -> None:
+    path = tmp_path / "four.mcap"
+    given = ["simulate", "--ei", "1,1,.4,1,1,1,1", "--axles", "4", "--noise", "25", "--rate", "200"]
+    assert main([*given, "--road-surface", "--friction", "0.08", "-o", str(path)]) == 0
+    site = site_of([path], None)
+    vehicle = site.vehicles[0]
+    assert vehicle.total_mass_kg == usual_four_axles(25.0).total_mass_kg
+    assert [one.channel for one in vehicle.sensors if one.axle] == ["unsprung_3", "unsprung_4"]
+    (result,) = identify_recordings([path], site, IdentificationSettings(method="pre")).crossings
+    assert result.verdict == "good"
+    assert result.parameters is not None
+    assert {"k_u3", "k_u4", "m_u3", "m_u4", "share"} <= result.parameters.keys()
+    assert first_compared_axle(result) == 3
+    for number in range(1, 8):
+        element = result.parameters[f"EI_{number}"]
+        true = 0.4 if number == 3 else 1.0
+        nominal = site.bridges[0].nominal_flexural_rigidity_nm2[number - 1]
+        error = np.log(element.mean / (true * nominal))
+        assert abs(error) < 4.0 * element.std / element.mean
+
+
+def test_four_axles_carry_what_the_site_declares() -> None:
+    site = SITE.model_copy(update={"vehicles": (usual_four_axles(25.0),)})
+    vehicle = site.vehicles[0]
+    case = tandem_case(site, np.ones(site.bridges[0].elements), TandemDrive(("A", 1)))
+    assert [bogie.axles for bogie in case.truck.bogies] == [(2, 3)]
+    loads = static_axle_loads_n(case.truck) / G
+    np.testing.assert_allclose(loads, [axle.load_kg or 0.0 for axle in vehicle.axles], rtol=0.02)
+    drawn = drawn_vehicle(vehicle, 3)
+    assert drawn.tandem is not None
+    assert drawn.tandem.gap_m != 1.35 != drawn.tandem.share
+    assert drawn.bogies[0].axles == (3, 4)
+    assert drawn.axles[1].position_m == 1.95
+
+
+def test_springs_of_their_own_carry_their_weighed_loads() -> None:
     site = parse_site(TEXT.replace("equalised = true", "equalised = false"), "site.toml")
+    vehicle = site.vehicles[0]
     case = tandem_case(site, np.ones(site.bridges[0].elements), TandemDrive(("A", 1)))
     assert case.truck.bogies == ()
-    assert static_axle_loads_n(case.truck).sum() == pytest.approx(
-        G * site.vehicles[0].total_mass_kg
-    )
+    weighed = np.array([axle.load_kg or 0.0 for axle in vehicle.axles])
+    weighed *= vehicle.total_mass_kg / weighed.sum()
+    np.testing.assert_allclose(static_axle_loads_n(case.truck) / G, weighed, rtol=0.02)
 
 
 def test_antenna_and_latency_are_in_the_positions() -> None:
@@ -145,7 +183,7 @@ def test_drawn_crossing_has_the_errors_of_the_truth() -> None:
     with pytest.raises(InputError, match="has a tandem, it must be a truck of two axles"):
         drive(site, truth, 7)
     own = parse_site(TEXT.replace("equalised = true", "equalised = false"), "site.toml")
-    with pytest.raises(InputError, match="axles 2 and 3 have springs of their own"):
+    with pytest.raises(InputError, match="the axles of its tandem have springs of their own"):
         drawn_tandem(own, truth, 7, 1)
 
 
