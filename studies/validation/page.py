@@ -33,6 +33,12 @@ No real bridge is among the crossings: no public recording of one is known.
 
 ## Targets
 
+Errors are judged in ln EI, in which the prior is normal: z = (ln median − ln truth) over the
+standard deviation that the 2.5 and 97.5 % quantiles give. The bound is the Cramér–Rao bound of the
+same residuals, receiver and priors at the truth, where the variance of a restraint is that of a
+normal truncated at zero, without absence, so standard deviations can be smaller. Standard errors
+(±) follow from the scatter between crossings.
+
 {targets}
 
 {missed} of {all} targets are missed.{unlisted}
@@ -64,12 +70,7 @@ follow it is not tested here.
 
 ![Errors, coverage, ranks and widths]({image})
 
-Errors are judged in ln EI, in which the prior is normal: z = (ln median − ln truth) over the
-standard deviation that the 2.5 and 97.5 % quantiles give. The common scale uncertainty (total mass,
-gain) is part of both the interval and the truth. The bound is the Cramér–Rao bound of the same
-residuals, receiver and priors at the truth, where the variance of a restraint is that of a normal
-truncated at zero, without absence, so standard deviations can be smaller. Standard errors
-(±) follow from the scatter between crossings.
+The common scale uncertainty (total mass, gain) is part of both the interval and the truth.
 
 {elements}
 
