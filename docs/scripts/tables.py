@@ -261,6 +261,7 @@ _RESULTS: tuple[tuple[str, type[BaseModel]], ...] = (
     ("`road`", results.RoadResult),
     ("`mismatch`", results.RoadMismatch),
     ("`fusion_likelihood`", fusion.FusionLikelihood),
+    ("`footprints`: contact patches", fusion.AxleFootprint),
     ("`bridges`", results.BridgeResult),
     ("`EI_1` … (N·m²), `level`, `thirds` (relative to nominal) of a bridge", results.ElementState),
     ("`tracks`", results.Track),
