@@ -28,6 +28,7 @@ class Alarm(StrictModel):
     """A detected change of a bridge. Times are seconds since 1970 UTC."""
 
     edition: Literal[1] = 1
+    """Format version."""
     alarm_id: Annotated[str, Field(pattern=rf"^{IDENTIFIER}$")]
     realm: Annotated[str, AfterValidator(check_realm)]
     bridge: Annotated[str, Field(pattern=rf"^{IDENTIFIER}$")]

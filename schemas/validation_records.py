@@ -139,6 +139,7 @@ class ValidationRecord(StrictModel):
     hash: Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
     """Hash of everything that the record covers: `pair_hash`."""
     method_edition: int
+    """Method version: `METHOD_EDITION` at the time of the simulation."""
     vehicle: str
     bridge: str
     settings: dict[str, JsonValue]

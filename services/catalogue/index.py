@@ -37,7 +37,7 @@ from services.common.stores import (
 from services.finding.bridges import Box
 
 _log = logging.getLogger(__name__)
-EDITION: Final = "1"
+FORMAT_VERSION: Final = "1"
 _KEY = "driveby.catalog"
 _LATEST_NS = (1 << 63) - 1
 """The latest valid time, in the year 2262."""
@@ -271,13 +271,13 @@ def _file_of(rows: list[CatalogRow]) -> bytes:
             "details": [details_text(row) for row in rows],
         }
     )
-    return encoded(table, _KEY, EDITION, compression="zstd" if len(rows) > 1 else "none")
+    return encoded(table, _KEY, FORMAT_VERSION, compression="zstd" if len(rows) > 1 else "none")
 
 
 def _rows_of(content: bytes) -> list[CatalogRow]:
     """Return the rows of a file; ValueError if it is not of this format version."""
     try:
-        return [_row(one) for one in decoded(content, _KEY, EDITION).to_pylist()]
+        return [_row(one) for one in decoded(content, _KEY, FORMAT_VERSION).to_pylist()]
     except KeyError as error:
         raise ValueError(f"is not a file of {_KEY} (lacks {error})") from None
     except (TypeError, AttributeError) as error:

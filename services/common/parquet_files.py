@@ -49,15 +49,18 @@ def arrow() -> Any:
     return pa
 
 
-def encoded(table: "pa.Table", key: str, edition: str, *, compression: str = "zstd") -> bytes:
-    """Return the bytes of a Parquet file with a table, optimised for small size."""
+def encoded(table: "pa.Table", key: str, version: str, *, compression: str = "zstd") -> bytes:
+    """Return the bytes of a Parquet file with a table, optimised for small size.
+
+    Its metadata have the format `version` under `key`.
+    """
     import pyarrow.parquet as pq
 
     out = io.BytesIO()
     # A file of few rows would consist mostly of statistics and dictionaries of one value.
     lean = {"use_dictionary": False, "write_statistics": False, "store_schema": False}
     with pq.ParquetWriter(out, table.schema, compression=compression, **lean) as writer:
-        writer.add_key_value_metadata({key: edition})
+        writer.add_key_value_metadata({key: version})
         writer.write_table(table)
     return out.getvalue()
 
@@ -73,7 +76,7 @@ class ReadLimits(NamedTuple):
 def decoded(
     source: "bytes | Path",
     key: str,
-    edition: str,
+    version: str,
     columns: list[str] | None = None,
     most: ReadLimits | None = None,
 ) -> "pa.Table":
@@ -85,9 +88,10 @@ def decoded(
         file = pq.ParquetFile(io.BytesIO(source) if isinstance(source, bytes) else source)
         metadata = file.metadata.metadata or {}
         theirs = metadata.get(key.encode(), b"").decode(errors="replace")
-        if theirs != edition:
+        if theirs != version:
             raise ValueError(
-                f"is of edition {theirs[:20] or 'none'} of {key}, this program knows {edition}"
+                f"is of format version {theirs[:20] or 'none'} of {key}, "
+                f"this program knows {version}"
             )
         if most is not None:
             _check_size(file.metadata, most)

@@ -47,12 +47,12 @@ def site_of(recordings: list[Path], site: Path | None) -> Site:
 
 def header_of(site: Site, settings: IdentificationSettings, created_s: float) -> ResultHeader:
     """Return the header of results; `created_s` is in seconds since 1970 UTC."""
-    edition = {"method_edition": METHOD_EDITION} if settings.method == "pre" else {}
+    method_version = {"method_edition": METHOD_EDITION} if settings.method == "pre" else {}
     return ResultHeader(
         version=program_version(),
         created=created_s,
         site_hash=site_hash(site),
-        settings=settings.model_dump(mode="json") | edition,
+        settings=settings.model_dump(mode="json") | method_version,
         seed=settings.seed,
     )
 

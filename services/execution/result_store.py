@@ -26,7 +26,7 @@ from services.identification.known import search_hash
 if TYPE_CHECKING:
     import pyarrow as pa
 
-EDITION: Final = "1"
+FORMAT_VERSION: Final = "1"
 KEY: Final = "driveby.identified"
 BRIDGES: Final = "bridges.json"
 """Results file next to the results, with the bridges alone, of the run that ended last."""
@@ -252,7 +252,7 @@ def _table(path: Path, *columns: str) -> "pa.Table":
         check_ordinary(path)
     except InputError as error:
         raise ValueError(str(error).removeprefix(f"{path}: ")) from None
-    table = decoded(path, KEY, EDITION, list(columns), _MOST)
+    table = decoded(path, KEY, FORMAT_VERSION, list(columns), _MOST)
     kinds = [(field.name, str(field.type)) for field in table.schema]
     if sorted(kinds) != sorted((name, _KINDS[name]) for name in columns):
         raise ValueError(f"has columns {kinds} where results have others")
@@ -281,4 +281,4 @@ def _file_of(found: list[StoredResult], header: ResultHeader) -> bytes:
             "header": pa.array([head] * len(found), pa.binary()),
         }
     )
-    return encoded(table, KEY, EDITION, compression="none")
+    return encoded(table, KEY, FORMAT_VERSION, compression="none")

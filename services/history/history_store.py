@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from services.identification.usable import FusableCrossing
 
 _log = logging.getLogger(__name__)
-EDITION: Final = "1"
+FORMAT_VERSION: Final = "1"
 KEY: Final = "driveby.history"
 CROSSINGS: Final = "crossings"
 _SIZES = struct.Struct("<HH")
@@ -201,7 +201,7 @@ def _stored(where: Path) -> tuple[set[str], dict[str, tuple[float, bool, str]]]:
 def _rows(path: Path, columns: list[str] | None = None) -> tuple[list[HistoryRow], list[str]]:
     """Return the crossings of a file, and a line if it, or some of its rows, is unreadable."""
     try:
-        table = decoded(path, KEY, EDITION, columns)
+        table = decoded(path, KEY, FORMAT_VERSION, columns)
     except ValueError as error:
         return [], [f"{path}: left out: {error}"]
     rows: list[HistoryRow] = []
@@ -243,7 +243,7 @@ def _write(where: Path, rows: Iterable[HistoryRow]) -> Path:
         path = where / f"{digest}{f'-{number}' if number > 1 else ''}.parquet"
         if not path.exists():
             make_folder(where)
-            write_atomically(path, encoded(_table(ordered), KEY, EDITION))
+            write_atomically(path, encoded(_table(ordered), KEY, FORMAT_VERSION))
             break
         if [one.content for one in _rows(path)[0]] == contents:
             break

@@ -18,7 +18,7 @@ from schemas.settings import IdentificationSettings
 from services.common.errors import FailureError, InputError
 from services.common.files import make_folder, write_atomically
 from services.common.progress import Steps, no_step_progress
-from services.history.history_store import EDITION, HistoryRow, fusable_of
+from services.history.history_store import FORMAT_VERSION, HistoryRow, fusable_of
 from services.recordings.recording import program_version
 
 Unit = Literal["day", "week", "month"]
@@ -108,7 +108,7 @@ def _fused(
     cache: Path, bridge: str, crossings: list[HistoryRow], warn: Callable[[str], None]
 ) -> BridgeResult | None:
     names = " ".join(one.content for one in crossings)
-    name = hashlib.sha256(f"{EDITION} {program_version()} {names}".encode()).hexdigest()[:20]
+    name = hashlib.sha256(f"{FORMAT_VERSION} {program_version()} {names}".encode()).hexdigest()[:20]
     path = cache / f"{name}.json"
     try:
         return BridgeResult.model_validate_json(path.read_bytes())

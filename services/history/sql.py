@@ -8,7 +8,7 @@ from services.common.language import utc_day
 from services.common.parquet_files import FILES
 from services.history.history_store import (
     CROSSINGS,
-    EDITION,
+    FORMAT_VERSION,
     KEY,
     bridges_of,
     file_error,
@@ -42,7 +42,7 @@ SELECT * FROM results QUALIFY row_number() OVER (
 ) = 1
 """
 """Newest result of each crossing, by the rank that `read_partition` uses."""
-_EDITIONS: Final = """
+_FORMAT_VERSIONS: Final = """
 SELECT DISTINCT min(decode(value)) FILTER (decode(key) = $2)
 FROM parquet_kv_metadata($1) GROUP BY file_name
 """
@@ -83,7 +83,7 @@ def _run_query(question: str, files: str | list[str], problems: tuple[str, ...])
             asked = connection.extract_statements(question)
             if [one.type for one in asked] != [duckdb.StatementType.SELECT]:
                 raise InputError("--sql: one query that begins with SELECT … is expected")
-            _check_editions(connection, files)
+            _check_format_versions(connection, files)
             results = connection.read_parquet(files, hive_partitioning=True, union_by_name=True)
             results.create_view("results")
             connection.sql(_NEWEST).create_view("crossings")
@@ -93,11 +93,11 @@ def _run_query(question: str, files: str | list[str], problems: tuple[str, ...])
             raise InputError(f"--sql: {' '.join(str(error).split())[:300]}") from None
 
 
-def _check_editions(connection: "duckdb.DuckDBPyConnection", files: str | list[str]) -> None:
+def _check_format_versions(connection: "duckdb.DuckDBPyConnection", files: str | list[str]) -> None:
     """Raise InputError for a file of another format version: its columns may differ in meaning."""
-    found = connection.execute(_EDITIONS, [files, KEY]).fetchall()
-    if any(edition != EDITION for (edition,) in found):
-        raise InputError(f"a file is of another edition than {EDITION} of {KEY}")
+    found = connection.execute(_FORMAT_VERSIONS, [files, KEY]).fetchall()
+    if any(version != FORMAT_VERSION for (version,) in found):
+        raise InputError(f"a file is of another format version than {FORMAT_VERSION} of {KEY}")
 
 
 def _files(folder: Path) -> tuple[list[str], tuple[str, ...]]:

@@ -2,7 +2,7 @@
 
 The crossings are those of `studies.simulation.out_of_model`, each effect alone and all together.
 Records are appended to a file of JSON lines as soon as they are computed, and existing ones are not
-computed again: hours of crossings can be resumed. Another program, method edition, site or settings
+computed again: hours of crossings can be resumed. Another program, method version, site or settings
 give other crossings.
 """
 

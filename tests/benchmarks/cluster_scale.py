@@ -30,7 +30,7 @@ from services.common.parquet_files import decoded
 from services.execution.archive import ArchiveJob, identify_archive
 from services.execution.inline import InlineExecutor
 from services.execution.offline import site_of
-from services.execution.result_store import EDITION, KEY, ResultStore, files_of
+from services.execution.result_store import FORMAT_VERSION, KEY, ResultStore, files_of
 from services.identification.bridge_state import NOTHING_STORED
 from tests.drives import SAMPLE, drives
 from tests.faults.clusters import Running, RunningCluster, cluster, contents, start
@@ -180,7 +180,7 @@ def results(into: Path) -> dict[str, str]:
     """All results by what they were made from, without the seconds that they took."""
     found: dict[str, str] = {}
     for path in files_of(into):
-        rows = decoded(path, KEY, EDITION, ["content", "result"]).to_pylist()
+        rows = decoded(path, KEY, FORMAT_VERSION, ["content", "result"]).to_pylist()
         for row in rows:
             outcome = json.loads(zstandard.decompress(row["result"]))
             outcome["diagnostics"].pop("seconds", None)

@@ -104,7 +104,7 @@ def test_site_file_with_a_new_key_is_refused(tmp_path: Path) -> None:
 
 
 def of_edition_2(path: Path, to: Path) -> Path:
-    """Copy a Parquet file with another edition in its metadata."""
+    """Copy a Parquet file with another format version in its metadata."""
     table = pq.ParquetFile(path).read()
     (name,) = (key for key in pq.ParquetFile(path).metadata.metadata if b"driveby" in key)
     to.parent.mkdir(parents=True, exist_ok=True)
@@ -119,8 +119,8 @@ def test_history_of_another_edition_is_left_out_by_name(tmp_path: Path) -> None:
     path = of_edition_2(old, tmp_path / old.relative_to(BEFORE / "history"))
     line = file_error(path)
     assert line is not None
-    assert line.startswith(f"{path}: left out: is of edition 2 of ")
-    assert " edition than 1 of " in one_line(
+    assert line.startswith(f"{path}: left out: is of format version 2 of ")
+    assert " format version than 1 of " in one_line(
         lambda: query(tmp_path, "SELECT crossing_id FROM crossings")
     )
     assert path.is_file()
@@ -133,7 +133,7 @@ def test_stored_results_of_another_edition_are_left_out_by_name(tmp_path: Path) 
     problems: list[str] = []
     assert list(kept_results(tmp_path, problems.append)) == []
     (line,) = problems
-    assert line.startswith(f"{path}: left out: is of edition 2 of ")
+    assert line.startswith(f"{path}: left out: is of format version 2 of ")
     assert path.is_file()
 
 
@@ -145,7 +145,7 @@ def test_catalogue_of_another_edition_is_left_out_and_stays(tmp_path: Path) -> N
     found = read_catalog(folder_at(str(folder)))
     assert not found.rows
     (line,) = found.problems
-    assert "left out: is of edition 2 of " in line
+    assert "left out: is of format version 2 of " in line
     assert old.is_file()
 
 

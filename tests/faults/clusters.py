@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from schemas.results import load_results
 from services.common.parquet_files import decoded
-from services.execution.result_store import EDITION, KEY, files_of
+from services.execution.result_store import FORMAT_VERSION, KEY, files_of
 from tests import prepared
 from tests.endpoints import free_port
 from tests.parent import parent_environment
@@ -88,7 +88,7 @@ def contents(into: Path) -> list[str]:
     return [
         content
         for path in files_of(into)
-        for content in decoded(path, KEY, EDITION, ["content"])["content"].to_pylist()
+        for content in decoded(path, KEY, FORMAT_VERSION, ["content"])["content"].to_pylist()
     ]
 
 

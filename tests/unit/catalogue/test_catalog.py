@@ -290,7 +290,7 @@ def test_files_that_are_no_rows_get_a_line_and_stay(fleet: Path) -> None:
     torn.write_bytes(file.read_bytes()[:-40])
     other = file.with_name("other.parquet")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(catalog, "EDITION", "2")
+        patch.setattr(catalog, "FORMAT_VERSION", "2")
         rows = read_catalog(folder_at(str(fleet))).problems
         assert len(rows) == 2
         other.write_bytes(catalog._file_of([catalog.row_of(folder, catalog.files_below(
@@ -298,8 +298,8 @@ def test_files_that_are_no_rows_get_a_line_and_stay(fleet: Path) -> None:
     mended = update_catalog(folder)
     assert len(mended.rows) == 3
     newer, cut = sorted(mended.problems)
-    assert newer.endswith("other.parquet: left out: is of edition 2 of driveby.catalog, this "
-                          "program knows 1")  # fmt: skip
+    assert newer.endswith("other.parquet: left out: is of format version 2 of driveby.catalog, "
+                          "this program knows 1")  # fmt: skip
     assert "torn.parquet: left out: is not a file of driveby.catalog" in cut
     assert torn.exists()
     assert other.exists()
@@ -351,7 +351,7 @@ def test_rows_that_hold_something_else_get_a_line_and_are_made_anew(
     outcome[1] |= change
     for row in outcome:
         row |= {name: str(row[name]) for name in change if isinstance(outcome[1][name], str)}
-    file.write_bytes(encoded(pa.Table.from_pylist(outcome), catalog._KEY, catalog.EDITION))
+    file.write_bytes(encoded(pa.Table.from_pylist(outcome), catalog._KEY, catalog.FORMAT_VERSION))
     site = str(project / "docs/site.example.toml")
     assert cli.main(["catalog", str(fleet), "--site", site]) == 3
     output = capsys.readouterr()

@@ -17,7 +17,7 @@ from services.common.parquet_files import ReadLimits, encoded
 from services.execution import result_store as store_module
 from services.execution.result_store import (
     BRIDGES,
-    EDITION,
+    FORMAT_VERSION,
     KEY,
     ResultStore,
     StoredResult,
@@ -95,7 +95,7 @@ def test_what_others_cannot_read_is_no_result_either(
     assert path is not None
     outcome = pq.read_table(path).to_pylist()
     outcome[1] |= change
-    path.write_bytes(encoded(pa.Table.from_pylist(outcome), store_module.KEY, store_module.EDITION))
+    path.write_bytes(encoded(pa.Table.from_pylist(outcome), KEY, FORMAT_VERSION))
     kept, problems = ResultStore(tmp_path), list[str]()
     assert kept.result(first.content) == first.crossing
     assert kept.result(second.content) is None
@@ -125,7 +125,7 @@ def test_where_nothing_can_be_written(tmp_path: Path) -> None:
 
 
 def foreign(**columns: Any) -> bytes:
-    return encoded(pa.table(columns), KEY, EDITION)
+    return encoded(pa.table(columns), KEY, FORMAT_VERSION)
 
 
 @pytest.mark.parametrize(

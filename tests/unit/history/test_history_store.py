@@ -187,14 +187,14 @@ def test_damaged_files_and_other_editions_get_a_line_and_stay(
     torn.write_bytes(torn.read_bytes()[:-100])
     noise.write_bytes(b"PAR1 this is no table PAR1")
     with monkeypatch.context() as patch:
-        patch.setattr(history_store, "EDITION", "2")
+        patch.setattr(history_store, "FORMAT_VERSION", "2")
         add_results(tmp_path, some.model_copy(update={"crossings": some.crossings[3:]}))
     read = read_partition(where(tmp_path))
     assert len(read.crossings) == 2
     lines = "\n".join(read.problems)
     assert f"{torn}: left out: is not a file of driveby.history" in lines
     assert f"{noise}: left out: is not a file of driveby.history" in lines
-    assert "left out: is of edition 2 of driveby.history, this program knows 1" in lines
+    assert "left out: is of format version 2 of driveby.history, this program knows 1" in lines
     assert len(read.problems) == 3
     # What is lost is added again; what cannot be read is never removed.
     monkeypatch.setattr(history_store, "_MAX_FILES", 0)
@@ -410,7 +410,7 @@ def rewritten(path: Path, row: int, change: dict[str, object]) -> None:
             elif not is_alike:
                 one[name] = type(value)()
     path.write_bytes(
-        encoded(pa.Table.from_pylist(outcome), history_store.KEY, history_store.EDITION)
+        encoded(pa.Table.from_pylist(outcome), history_store.KEY, history_store.FORMAT_VERSION)
     )
 
 
@@ -506,11 +506,11 @@ def test_questions_leave_out_another_edition_too(
     some = crossings(3)
     add_results(tmp_path, some.model_copy(update={"crossings": some.crossings[:2]}))
     with monkeypatch.context() as patch:
-        patch.setattr(history_store, "EDITION", "2")
+        patch.setattr(history_store, "FORMAT_VERSION", "2")
         add_results(tmp_path, some.model_copy(update={"crossings": some.crossings[2:]}))
     assert cli.main(["history", "--history", str(tmp_path)]) == 0
     line, _, row = capsys.readouterr().out.splitlines()
-    assert "left out: is of edition 2 of driveby.history, this program knows 1" in line
+    assert "left out: is of format version 2 of driveby.history, this program knows 1" in line
     assert row.split()[:3] == ["sim-fleet", "bridge-1", "2"]
 
 
