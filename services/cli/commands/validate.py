@@ -39,6 +39,7 @@ from services.simulation.validation_options import (
 )
 
 _CHECKOUT: Final = Path(__file__).parents[3]
+_TRUTHS: Final = _CHECKOUT.parent / "shared/crossings"
 _Options = TypeVar(
     "_Options", SiteValidationOptions, ScenarioOptions, IntervalOptions, SurveyOptions
 )
@@ -153,9 +154,9 @@ class ValidateOptions:
     )
     truth: Path = opt(
         "folder with a subfolder for each crossing of another simulator, with its truth.json "
-        "(default: ../shared/crossings)",
+        "(default: shared/crossings next to the checkout; left out where it is missing)",
         Path,
-        default=Path("../shared/crossings"),
+        default=_TRUTHS,
         metavar="DIR",
     )
     processes: int = count_option("number of processes", "processes", 2, 1, 256)
@@ -175,6 +176,8 @@ def _validate(asked: ValidateOptions) -> int:
         run_surveys = _study("validation.run_surveys")
         code = run_surveys.run(_of_kind(SurveyOptions, asked), a_console())
     elif asked.method == "pre":
+        if asked.truth != _TRUTHS and not asked.truth.is_dir():
+            raise InputError(f"--truth: {asked.truth} is not a folder, name one with crossings")
         run_intervals = _study("validation.run_intervals")
         code = run_intervals.run(_of_kind(IntervalOptions, asked), a_console())
     else:

@@ -95,3 +95,20 @@ def test_all_and_some_names_are_taken() -> None:
     everything = parsed("--effects", "all", "--kinds", "all")
     assert (everything.effects, everything.kinds) == (EFFECTS, tuple(KINDS))
     assert parsed("--kinds", "twin, steady,twin").kinds == ("twin", "steady")
+
+
+def test_truth_is_sought_next_to_the_checkout_from_any_folder(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, project: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert parsed().truth == project.parent / "shared/crossings"
+
+
+def test_named_truth_that_is_no_folder_is_refused_in_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    nowhere = tmp_path / "nowhere"
+    assert cli.main(["validate", "--method", "pre", "--truth", str(nowhere)]) == 2
+    assert capsys.readouterr().err == (
+        f"driveby: --truth: {nowhere} is not a folder, name one with crossings\n"
+    )
