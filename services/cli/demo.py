@@ -358,11 +358,11 @@ def _print(console: "Console", crossing: CrossingResult, drive: SimulatedDrive, 
     nominal = site.bridge(crossing.bridge).nominal_flexural_rigidity_nm2
     has_meaning = "no_noise_model" not in crossing.reasons
     table = Table(
-        title="Flexural rigidity as a ratio to the undamaged bridge", title_justify="left"
+        title="Flexural rigidity EI relative to the undamaged bridge", title_justify="left"
     )
     table.add_column("element")
     misses = 0
-    for heading in ("truth", "estimate", "interval (95 %)", "contains the truth"):
+    for heading in ("truth", "estimate", "95 % interval", "contains the truth"):
         table.add_column(heading, justify="right")
     for number, (nominal_ei, truth) in enumerate(
         zip(nominal, drive.rigidity_ratios, strict=True), start=1
@@ -378,10 +378,12 @@ def _print(console: "Console", crossing: CrossingResult, drive: SimulatedDrive, 
             misses += holds == "no"
         table.add_row(f"EI_{number}", f"{truth:.3f}", f"{p.mean / nominal_ei:.3f}", interval, holds)
     console.print(table)
+    if has_meaning and parameters:
+        console.print("A 95 % interval contains the truth in 95 of 100 cases.")
     if misses:
         share = 100.0 * (1.0 - _INTERVAL ** len(nominal))
         console.print(
-            f"Of {len(nominal)} intervals (95 %) at least one misses the truth "
+            f"At least one of {len(nominal)} such intervals misses the truth "
             f"in {share:.0f} % of crossings."
         )
     if not has_meaning:

@@ -76,7 +76,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory, project: Path) -> Demo:
 ROW = re.compile(r"EI_(\d) \D*([\d.]+) \D*([\d.]+) \D*([\d.]+) … ([\d.]+) \D*(yes|no)")
 
 
-def test_it_works(demo: Demo) -> None:
+def test_demo_prints_truth_estimate_and_interval(demo: Demo) -> None:
     assert (demo.code, demo.err) == (0, "")
     rows = ROW.findall(demo.out)
     assert [(number, float(truth)) for number, truth, *_ in rows] == [
@@ -86,6 +86,7 @@ def test_it_works(demo: Demo) -> None:
         assert float(low) < float(estimate) < float(high)
         assert (holds == "yes") == (float(low) <= float(truth) <= float(high))
     assert rows[3][-1] == "yes"
+    assert "A 95 % interval contains the truth in 95 of 100 cases.\n" in demo.out
     assert "verdict good" in demo.out
     assert all(name in demo.out for name in FILES)
 
