@@ -45,7 +45,7 @@ class SimulateOptions:
     """Options of `driveby simulate`: truth, drive, effects and the recording."""
 
     scenario: int | None = opt(
-        "damage scenario of the paper, 1 to 12",
+        "damage scenario of the paper, 1 to 12, see docs/validation.md",
         scenario,
         alternatives=_TRUTH,
         required=True,

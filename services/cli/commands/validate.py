@@ -82,7 +82,7 @@ class ValidateOptions:
     """Options of `driveby validate`, of all kinds together."""
 
     scenarios: tuple[int, ...] = opt(
-        "scenarios of the paper (default: all)",
+        "scenarios of the paper, see docs/validation.md (default: all)",
         _scenarios,
         default=tuple(SCENARIOS),
         metavar="all|1,6,12",
