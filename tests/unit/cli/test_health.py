@@ -130,10 +130,15 @@ def test_services_of_one_name_are_counted(endpoint: str) -> None:
         declare(publishers[0])
         alone = line()
         declare(publishers[1])
-        # The router learns of a publisher when its declaration arrives.
-        until(lambda: ";" in line())
-        both = line()
+        # The router learns of a publisher when its declaration arrives, and each client again.
+        lines = [alone]
+
+        def are_both_counted() -> bool:
+            lines.append(line())
+            return ";" in lines[-1]
+
+        until(are_both_counted)
         for publisher in publishers:
             publisher.close()
     assert alone == "worker in realm live is well (health sent 0 s ago)"
-    assert both.partition(";")[2] == " one of 2 services of this name; give each one another --id"
+    assert lines[-1].partition(";")[2] == " one of 2 services of this name; give each one another --id"
