@@ -141,4 +141,6 @@ def test_services_of_one_name_are_counted(endpoint: str) -> None:
         for publisher in publishers:
             publisher.close()
     assert alone == "worker in realm live is well (health sent 0 s ago)"
-    assert lines[-1].partition(";")[2] == " one of 2 services of this name; give each one another --id"
+    assert (
+        lines[-1].partition(";")[2] == " one of 2 services of this name; give each one another --id"
+    )
