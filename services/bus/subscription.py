@@ -183,7 +183,7 @@ class Subscription:
         due = []
         with self._lock:
             for name, source in self._sources.items():
-                gaps = source.numbers.holes_from_zero()
+                gaps = source.numbers.gaps_from_zero()
                 tries = {gap: source.tries.get(gap, -1) + 1 for gap in gaps}
                 source.tries = tries
                 due += [(name, gap) for gap, n in tries.items() if 0 < n <= _GAP_TRIES]

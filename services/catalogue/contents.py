@@ -256,7 +256,7 @@ def _stream(name: str, of_truck: list[_StreamArrivals]) -> StreamSummary:
     has_rate = topic("vehicle", name).nominal_rate_hz is not None and steps
     return StreamSummary(
         sum(arrivals.sequences.size for arrivals in of_truck),
-        sum(b - a + 1 for arrivals in of_truck for a, b in arrivals.sequences.holes()),
+        sum(b - a + 1 for arrivals in of_truck for a, b in arrivals.sequences.gaps()),
         NS_PER_S / median(steps) if has_rate else None,
     )
 

@@ -13,7 +13,7 @@ def default_endpoint(tls: Path | None) -> str:
     return DEFAULT_ENDPOINT if tls is None else DEFAULT_TLS_ENDPOINT
 
 
-class OnTheBus:
+class BusOptions:
     """Options of a command that connects to a logger."""
 
     endpoint: str | None

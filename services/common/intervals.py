@@ -111,14 +111,14 @@ class Intervals:
         """The number of runs, which determines the memory of the set."""
         return len(self._first)
 
-    def holes(self) -> list[tuple[int, int]]:
+    def gaps(self) -> list[tuple[int, int]]:
         """Return (first, last) of every gap between numbers in the set."""
         return [
             (last + 1, first - 1)
             for last, first in zip(self._last[:-1], self._first[1:], strict=True)
         ]
 
-    def holes_from_zero(self) -> list[tuple[int, int]]:
+    def gaps_from_zero(self) -> list[tuple[int, int]]:
         """Return the gaps, and the one from 0 to the lowest number in the set."""
         before = [(0, self._first[0] - 1)] if self._first and self._first[0] > 0 else []
-        return before + self.holes()
+        return before + self.gaps()

@@ -79,7 +79,7 @@ class Intake:
     _given_up: dict[tuple[Key, int], Intervals] = field(default_factory=dict)
     """Lost messages, which may arrive all the same: a truck with a full disk holds only those that
     are on their way."""
-    _holes: dict[tuple[Key, int], dict[tuple[int, int], float]] = field(default_factory=dict)
+    _gaps: dict[tuple[Key, int], dict[tuple[int, int], float]] = field(default_factory=dict)
     _reported: dict[tuple[Key, int], Intervals] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -175,7 +175,7 @@ class Intake:
                 )
         self._lost.clear()
         patience_s = 0.0 if closing else GAP_PATIENCE_S
-        events += self._gaps(now_ns, now_s, patience_s)
+        events += self._gap_events(now_ns, now_s, patience_s)
         events += self._clocks.drifts(now_ns, now_s)
         return events
 
@@ -189,7 +189,7 @@ class Intake:
 
     def _forget(self, where: Key, boot_id: int) -> None:
         name = (where, boot_id)
-        for memory in (self.seen.streams, self._holes, self._reported, self._given_up):
+        for memory in (self.seen.streams, self._gaps, self._reported, self._given_up):
             memory.pop(name, None)
         self.forgotten.append(name)
         self._clocks.forget(where, boot_id)
@@ -256,21 +256,21 @@ class Intake:
             events.append((Key(refusals.realm, "vehicle", vehicle, ""), event))
         return events
 
-    def _gaps(self, now_ns: int, now_s: float, patience_s: float) -> list[tuple[Key, Event]]:
+    def _gap_events(self, now_ns: int, now_s: float, patience_s: float) -> list[tuple[Key, Event]]:
         events = []
         missing = 0
         for name, numbers in self.seen.streams.items():
-            since = self._holes.pop(name, {})
+            since = self._gaps.pop(name, {})
             if numbers.runs < 2:
                 continue
-            holes = {hole: _since(since, hole, now_s) for hole in numbers.holes()}
-            self._holes[name] = holes
+            gaps = {gap: _since(since, gap, now_s) for gap in numbers.gaps()}
+            self._gaps[name] = gaps
             reported = self._reported.setdefault(name, Intervals())
-            for hole, first_s in holes.items():
+            for gap, first_s in gaps.items():
                 if now_s - first_s < patience_s:
                     continue
-                missing += hole[1] - hole[0] + 1
-                for first, last in reported.missing_of([hole]):
+                missing += gap[1] - gap[0] + 1
+                for first, last in reported.missing_of([gap]):
                     reported.add_range(first, last)
                     where, boot_id = name
                     number = last - first + 1
@@ -309,13 +309,13 @@ def _touches(numbers: Intervals, sequence: int) -> bool:
     return any(n in numbers for n in (sequence, sequence - 1, sequence + 1))
 
 
-def _since(before: dict[tuple[int, int], float], hole: tuple[int, int], now_s: float) -> float:
+def _since(before: dict[tuple[int, int], float], gap: tuple[int, int], now_s: float) -> float:
     """Return the start of a gap, also if it was part of a larger one."""
-    if hole in before:
-        return before[hole]
+    if gap in before:
+        return before[gap]
     larger = list(before)
-    at = bisect_right(larger, hole[0], key=lambda one: one[0]) - 1
-    if at >= 0 and larger[at][1] >= hole[1]:
+    at = bisect_right(larger, gap[0], key=lambda one: one[0]) - 1
+    if at >= 0 and larger[at][1] >= gap[1]:
         return before[larger[at]]
     return now_s
 

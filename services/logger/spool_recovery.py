@@ -162,7 +162,7 @@ class SpoolRecovery:
         self._complaints = RateLimitedLog(_log)
         self._listing = SpoolListing(bus, realms, self._complaints)
         self._next_list_s = 0.0
-        self._with_holes: dict[Key, set[int]] | None = None
+        self._with_gaps: dict[Key, set[int]] | None = None
         self._busy = False
 
     def step(self, now_s: float, *, hold: bool = False) -> list[RawSample]:
@@ -170,7 +170,7 @@ class SpoolRecovery:
         if now_s >= self._next_list_s:
             self._next_list_s = now_s + LIST_PERIOD_S
             self._listing.ask()
-            self._with_holes = None
+            self._with_gaps = None
             self._complaints.flush()
         began_s = time.monotonic()
         while time.monotonic() - began_s < _COMPARE_S and (answer := self._listing.next_answer()):
@@ -280,22 +280,22 @@ class SpoolRecovery:
 
     def _forgotten(self, truck: _Truck, where: Key, listed: set[int], newest: int) -> None:
         """Give up the gaps of earlier boots that the truck has not listed for two rounds."""
-        if self._with_holes is None:
-            self._with_holes = {}
+        if self._with_gaps is None:
+            self._with_gaps = {}
             for (one, boot_id), numbers in self._seen.streams.items():
                 if numbers.runs > 1:
-                    self._with_holes.setdefault(one, set()).add(boot_id)
+                    self._with_gaps.setdefault(one, set()).add(boot_id)
             for one, boot_id in self._gone:
-                self._with_holes.setdefault(one, set()).add(boot_id)
+                self._with_gaps.setdefault(one, set()).add(boot_id)
         unlisted = {
             (where, boot_id)
-            for boot_id in self._with_holes.get(where, ())
+            for boot_id in self._with_gaps.get(where, ())
             if boot_id < newest and boot_id not in listed
         }
         for name in unlisted & truck.unlisted:
             seen = self._seen.streams.get(name, Intervals())
             gone = self._gone.get(name, Intervals())
-            for first, last in [*seen.holes(), *seen.missing_of(gone.ranges())]:
+            for first, last in [*seen.gaps(), *seen.missing_of(gone.ranges())]:
                 self._lost(*name, first, last)
         truck.unlisted = {name for name in truck.unlisted if name[0] != where} | unlisted
 

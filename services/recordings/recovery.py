@@ -393,4 +393,4 @@ def _name(channel: Channel) -> tuple[Key, int] | None:
 
 
 def _missing(numbers: Intervals) -> int:
-    return sum(last - first + 1 for first, last in numbers.holes())
+    return sum(last - first + 1 for first, last in numbers.gaps())

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from services.common.endpoints import OnTheBus
+from services.common.endpoints import BusOptions
 from services.common.options import (
     endpoint_option,
     flag,
@@ -25,7 +25,7 @@ def _selection(text: str, metavar: str) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplaySettings(OnTheBus):
+class ReplaySettings(BusOptions):
     """Options of `driveby replay`: a drive, its published part, and the pace."""
 
     recordings: tuple[Path, ...] = positional(

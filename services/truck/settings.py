@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from services.common.endpoints import OnTheBus
+from services.common.endpoints import BusOptions
 from services.common.options import (
     endpoint_option,
     flag,
@@ -33,7 +33,7 @@ def _spool_budget_option() -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TruckSettings(OnTheBus):
+class TruckSettings(BusOptions):
     """Options of `driveby truck`: a recording, and the bus on which it is published."""
 
     recording: Path = positional(
@@ -61,7 +61,7 @@ class TruckSettings(OnTheBus):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GatewaySettings(OnTheBus):
+class GatewaySettings(BusOptions):
     """Options of `driveby gateway`: a ROS 2 router, its truck, and the bus for its data."""
 
     what: str = positional(

@@ -79,7 +79,7 @@ class Spool:
             raise InputError(f"spool budget of {budget_bytes} bytes; at least {least} MiB")
         self.folder = folder
         self.budget_bytes = budget_bytes
-        self.torn_bytes = 0
+        self.discarded_bytes = 0
         """Bytes removed at the opening, because they were cut off or damaged."""
         self._segment_bytes = min(_LARGEST_SEGMENT_BYTES, budget_bytes // _SEGMENTS_IN_BUDGET)
         self._lock = threading.Lock()
@@ -88,8 +88,8 @@ class Spool:
             highest, self._past = _read_state(folder / _STATE)
             self._segments = []
             for path in sorted(folder.glob("*.spool")):
-                segment, torn_bytes = _load(path)
-                self.torn_bytes += torn_bytes
+                segment, discarded_bytes = _load(path)
+                self.discarded_bytes += discarded_bytes
                 self._segments += [segment] if segment is not None else []
         boots = [highest, *(segment.boot_id for segment in self._segments)]
         self.boot_id = max(time.time_ns(), max(boots) + 1)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from services.common.endpoints import LOOPBACK, OnTheBus
+from services.common.endpoints import LOOPBACK, BusOptions
 from services.common.options import (
     endpoint_option,
     flag,
@@ -22,7 +22,7 @@ _LIVE: Final = "live"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewSettings(OnTheBus):
+class ViewSettings(BusOptions):
     """Options of `driveby view`: a file or the bus, and the address for viewers."""
 
     target: str = positional(

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from services.common.endpoints import OnTheBus
+from services.common.endpoints import BusOptions
 from services.common.options import (
     config_option,
     endpoint_option,
@@ -26,7 +26,7 @@ _VALIDATION = "validation"
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorkerSettings(OnTheBus):
+class WorkerSettings(BusOptions):
     """Settings of one run of the worker."""
 
     config: Path | None = config_option()

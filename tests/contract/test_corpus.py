@@ -84,7 +84,7 @@ def test_results_of_a_commit_are_read(corpus: Path) -> None:
 def test_spool_of_a_commit_is_read(corpus: Path) -> None:
     spool = Spool(corpus / "spool")
     try:
-        assert spool.torn_bytes == 0
+        assert spool.discarded_bytes == 0
         held = {stream: spool.contents(stream) for stream in spool.streams()}
         assert held
         for stream, (boot,) in held.items():

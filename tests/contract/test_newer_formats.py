@@ -186,7 +186,7 @@ def test_spool_of_another_format_is_refused_and_stays(tmp_path: Path) -> None:
     assert path.read_bytes() == newer
     path.write_bytes(content)
     reopened = Spool(tmp_path)
-    assert reopened.torn_bytes == 0
+    assert reopened.discarded_bytes == 0
     reopened.close()
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from services.cli.alarm_line import alarm_line
 from services.cli.parser import Subcommand
-from services.common.endpoints import OnTheBus
+from services.common.endpoints import BusOptions
 from services.common.errors import InputError
 from services.common.naming import count_of
 from services.common.options import (
@@ -41,7 +41,7 @@ _HOW = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class AlarmOptions(OnTheBus):
+class AlarmOptions(BusOptions):
     """Options of `driveby alarm`: the action, and how changes are detected."""
 
     what: str = positional(

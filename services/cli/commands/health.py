@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from services.cli.parser import Announce, ServiceCommand
-from services.common.endpoints import OnTheBus
+from services.common.endpoints import BusOptions
 from services.common.errors import InputError
 from services.common.options import (
     endpoint_option,
@@ -25,7 +25,7 @@ def _address(text: str) -> tuple[str, int]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HealthOptions(OnTheBus):
+class HealthOptions(BusOptions):
     """Services whose health is queried, and the form of the answer."""
 
     service: str | None = positional(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from services.cli.parser import Subcommand
 from services.cli.parsing import a_console
-from services.common.endpoints import OnTheBus
+from services.common.endpoints import BusOptions
 from services.common.options import endpoint_option, realm_option, tls_option
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ _HINT_AFTER_S: Final = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class WatchOptions(OnTheBus):
+class WatchOptions(BusOptions):
     """A realm to show."""
 
     endpoint: str | None = endpoint_option()

@@ -17,9 +17,9 @@ def test_as_a_set(numbers: list[int]) -> None:
         assert intervals.size == len(reference)
     assert all((number in intervals) == (number in reference) for number in range(42))
     assert intervals.highest == max(reference, default=None)
-    missing = [n for first, last in intervals.holes_from_zero() for n in range(first, last + 1)]
+    missing = [n for first, last in intervals.gaps_from_zero() for n in range(first, last + 1)]
     assert missing == sorted(set(range(max(reference, default=0))) - reference)
-    inner = [n for first, last in intervals.holes() for n in range(first, last + 1)]
+    inner = [n for first, last in intervals.gaps() for n in range(first, last + 1)]
     assert inner == [n for n in missing if n > min(reference)]
     contiguous = next(n for n in range(42) if n not in reference) - 1
     assert intervals.contiguous_from_zero == (contiguous if contiguous >= 0 else None)

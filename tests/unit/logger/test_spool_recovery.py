@@ -491,7 +491,7 @@ def test_a_boot_that_is_gone_from_disk_and_truck_is_lost(router: zenoh.Session) 
     logger.seen.numbers(ACCEL, 2).add_range(0, 4)
     boots = [SpoolBoot(2, 7, [(6, 6)], 6, 0), SpoolBoot(3, 1, [(0, 0)], 0, 0)]
     for _ in range(2):
-        logger.recovery._with_holes = None
+        logger.recovery._with_gaps = None
         logger.recovery._compare(SpoolListed(ACCEL, boots, False))
     assert logger.seen.streams[(ACCEL, 1)].ranges() == [(0, 2)]
     assert logger.lost == {0, 1, 2, 5}

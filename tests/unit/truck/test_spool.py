@@ -182,7 +182,7 @@ def test_a_record_shorter_than_its_own_head_is_no_record(tmp_path: Path, length:
     segment.write_bytes(whole + last)
     spool = Spool(tmp_path)
     assert sequences(spool, boot) == [0, 1, 2]
-    assert spool.torn_bytes == len(last)
+    assert spool.discarded_bytes == len(last)
     assert segment.read_bytes() == whole
     spool.close()
 
